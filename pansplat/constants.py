@@ -6,7 +6,8 @@ Source: docs/rendering.md.
 # Definition of an image.
 ALPHA_CUT = 1 / 255  # smaller alphas count as zero: less than one step of an 8-bit image
 MAX_ALPHA = 0.99  # keeps 1 - alpha, by which gradients divide, away from zero
-FILTER_VARIANCE = {"angular": 0.1, "3dgs": 0.3}  # pixel^2, added by the low-pass filters
+FILTER_VARIANCE = 0.1  # pixel^2, added across the ray by the low-pass filter
+EWA_DILATION = 0.3  # pixel^2: 3DGS adds it to the projected covariance
 NEAR = 0.05  # metres, by default; Gaussians whose mean is nearer are not rasterised
 EWA_NEAR_FACTOR = 0.2  # of `near`: 3DGS culls at this depth along the optical axis
 EWA_CLAMP = 1.3  # half sides of the image: 3DGS evaluates its Jacobian no farther from the centre

@@ -44,7 +44,7 @@ from pansplat.refinement import (
 )
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
-from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering.color_fit import fit_colors
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import choose_device, note_full_card, with_device
@@ -570,7 +570,7 @@ def fuse(scene: Scene, views: Views) -> Scene:
     if len(views.images) == 1:
         return scene
     fused = fuse_views(scene)
-    colors = fit_colors(fused.gaussians, views.images, fused.cam2world, views.masks, ColorFitConfig(), joint=True)
+    colors = fit_colors(fused.gaussians, views.images, fused.cam2world, views.masks, joint=True)
     return replace(fused, gaussians=colors)
 
 

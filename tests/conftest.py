@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from annotation_checks import restart_checks
 from hypothesis import HealthCheck, settings
 from jaxtyping import config, install_import_hook
 from PIL import Image
 from torch import Tensor
-
-from pansplat.system.testing import restart_checks
 
 # One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -58,7 +57,7 @@ _CHECKED = (
     "evaluation",
     "pipeline",
 )
-install_import_hook([f"pansplat.{name}" for name in _CHECKED], "pansplat.system.testing.check_types")
+install_import_hook([f"pansplat.{name}" for name in _CHECKED], "annotation_checks.check_types")
 
 pytest_plugins = ["panorama_fixtures"]  # imported after the hook
 

@@ -237,7 +237,7 @@ def test_original_drawing_uses_the_official_kernel_stitching_and_harmonics(scene
     pose = scene.pose_between(0.5)
     rendered = render(scene, pose, blend="joint", size=(32, 64), drawing="original").color
     official = replace(scene.gaussians, harmonics=official_harmonics(scene.gaussians.harmonics))
-    options = {"kernel": "ewa", "order": "z", "lowpass": "3dgs", "stitching": "official", "face_size": 16}
+    options = {"kernel": "ewa", "face_size": 16}
     expected = rasterize(official, pose, size=(32, 64), layout="cubemap", near=0.2 * scene.near, **options).color
     assert torch.equal(rendered, expected)
     assert not torch.allclose(rendered, render(scene, pose, blend="joint", size=(32, 64)).color, atol=1e-3)

@@ -36,7 +36,7 @@ _DOUBLES = ("camera", "directions", "radii", "covariances", "grad_directions", "
 _DOUBLES += ("grad_covariances", "grad_camera")
 _TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
 _SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
-_SIZES += ("DEGREE", "COMPENSATE", "EXACT", "BLOCK")
+_SIZES += ("DEGREE", "EXACT", "BLOCK")
 
 
 def _type(kernel, name: str) -> str:
@@ -80,7 +80,7 @@ def main() -> None:
         for group, at_once in ((16, 1), (1, 16)):
             sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
             _report(f"sum {group} x {at_once}", sum_gradients_kernel, 2, capability, **sizes)
-        sizes = dict(DEGREE=4, CHANNELS=3, COMPENSATE=True, EXACT=True, BLOCK=128)
+        sizes = dict(DEGREE=4, CHANNELS=3, EXACT=True, BLOCK=128)
         _report("project, degree 4", project_kernel, 4, capability, **sizes)
         sizes |= dict(BLOCK=64)
         _report("project backward", backpropagate_projection_kernel, 2, capability, **sizes)

@@ -6,12 +6,11 @@ rendered in turns, round after round, so that other load on the machine affects 
 Values of a row: `forward_ms` is the median without gradients, `backward_ms` that of the backward pass alone, to all
 fields of the Gaussians; each with `_min_ms`, `_spread_ms` (range between the quartiles) and `_cpu_ms` (minimum of the
 processor time of all threads). `peak_mb` is the largest additional memory of a forward pass, 10^6 bytes. `psnr_db` and
-`max_error` are against the exact image: kernel "ray", order "radial", filter "angular", one ray per pixel, float64.
+`max_error` are against the exact image: kernel "ray", one ray per pixel, float64.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,9 +42,9 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import rasterize
 from pansplat.rendering.cpu.runtime import release_idle_memory
-from pansplat.rendering.image_planes import Layout, Stitching
-from pansplat.rendering.official import OFFICIAL, official_face_size
-from pansplat.rendering.rasterize import Kernel, Lowpass, Order
+from pansplat.rendering.image_planes import Layout
+from pansplat.rendering.official import official_face_size
+from pansplat.rendering.rasterize import Kernel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,9 +67,8 @@ class RasterCase:
     Attributes:
         backend: "torch", "numba" or "triton".
         height: pixels; a panorama is twice as wide, a pinhole image square with a field of view of 90 degrees.
-        kernel, order, filter, layout: as in `pansplat.rasterize` (`filter` is its `lowpass`).
+        kernel, layout: as in `pansplat.rasterize`.
         face_size: of the faces of a cubemap, pixels.
-        stitching: of a cubemap.
         threads: the largest number to use.
         backward: whether the backward pass is timed as well.
     """
@@ -78,11 +76,8 @@ class RasterCase:
     backend: str
     height: int
     kernel: Kernel = "ray"
-    order: Order = "radial"
-    filter: Lowpass = "angular"
     layout: Layout = "equirect"
     face_size: int | None = None
-    stitching: Stitching = "seamless"
     precision: Precision = "float32"
     threads: int = 1
     backward: bool = True
@@ -100,13 +95,12 @@ class RasterCase:
 
     @property
     def layout_name(self) -> str:
-        """The layout with the size of its faces and its stitching."""
-        faces = f" {self.face_size}" if self.face_size else ""
-        return f"{self.layout}{faces}{' official' if self.stitching == 'official' else ''}"
+        """The layout with the size of its faces."""
+        return f"{self.layout} {self.face_size}" if self.face_size else self.layout
 
     def __str__(self) -> str:
         """The case as it is shown while it is measured."""
-        choice = f"{self.backend} {self.kernel} {self.order} {self.filter} {self.layout_name}"
+        choice = f"{self.backend} {self.kernel} {self.layout_name}"
         return f"{choice}, height {self.height}, {format_threads(self.threads)}"
 
     def render(self, gaussians: Gaussians, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "channel height width"]:
@@ -117,11 +111,8 @@ class RasterCase:
             size=(self.height, self.height if self.layout == "pinhole" else 2 * self.height),
             layout=self.layout,
             kernel=self.kernel,
-            order=self.order,
-            lowpass=self.filter,
             near=NEAR,
             face_size=self.face_size,
-            stitching=self.stitching,
             backend=self.backend,  # type: ignore[arg-type]
         )
         return rendered.color
@@ -156,7 +147,7 @@ def make_room_scene(height: int) -> BenchScene:
     """The synthetic room, rendered from a pose between its cameras and slightly off the line through them.
 
     The camera is rotated so that no wall is parallel to a cube face: all points of such a wall have one depth, and
-    order "z" would depend on rounding.
+    the order of kernel "ewa" would depend on rounding.
     """
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = rotations_from_quats(torch.tensor((0.97, 0.06, 0.21, 0.04), dtype=torch.float64))
@@ -172,7 +163,7 @@ def choice_height(height: int, *, quick: bool) -> int:
 def list_raster_groups(
     scene_of: Callable[[int], BenchScene], height: int, backends: Sequence[str], threads: int, *, quick: bool
 ) -> list[Group]:
-    """The main choices on the scene of this height, and all choices on the one of `choice_height`.
+    """All choices on the scene of this height, and on the one of `choice_height`.
 
     Args:
         scene_of: the scene for a height.
@@ -182,56 +173,30 @@ def list_raster_groups(
         quick: minutes instead of an hour.
     """
     small = choice_height(height, quick=quick)
-    headline = [case for name in backends for case in list_main_choices(name, height, threads)]
+    headline = [case for name in backends for case in list_choices(name, height, threads)]
     headline += [RasterCase(name, height) for name in backends if threads > 1]
     headline += [RasterCase("torch", height)] if lattice_room_size(height) <= _MAX_TORCH_GAUSSIANS else []
     choices = [case for name in backends for case in list_choices(name, small, threads)]
-    choices += list_main_choices("torch", small, 1) + ([] if quick else list_choices("torch", small, 1))
-    choices = list(dict.fromkeys(choices))
+    choices += list_choices("torch", small, 1)
     return [Group("headline", scene_of(height), headline), Group("choices", scene_of(small), choices)]
 
 
 def make_sample_group(scene: BenchScene, height: int, backends: Sequence[str], threads: int) -> Group:
-    """The main choices on a real scene, to check the results of the room."""
-    cases = [case for name in backends for case in list_main_choices(name, height, threads)]
-    return Group("scene", scene, cases + list_main_choices("torch", height, 1))
+    """All choices on a real scene, to check the results of the room."""
+    cases = [case for name in backends for case in list_choices(name, height, threads)]
+    return Group("scene", scene, cases + list_choices("torch", height, 1))
 
 
 def list_choices(backend: str, height: int, threads: int) -> list[RasterCase]:
-    """Every kernel, order and filter on every layout that has them; an equirect has one kernel and one order."""
-    direct, kernels = RasterCase(backend, height, threads=threads), _kernels(backend)
-    orders: tuple[Order, ...] = ("radial",) if backend == "numba" else ("radial", "z")
-    filters: tuple[Lowpass, ...] = ("angular", "3dgs")
-    stitched = replace(direct, layout="cubemap", face_size=default_face_size(height))
-    return [
-        *(replace(direct, filter=lowpass) for lowpass in filters),
-        *(
-            replace(stitched, kernel=kernel, order=order, filter=lowpass)
-            for kernel, order, lowpass in itertools.product(kernels, orders, filters)
-        ),
-        *(replace(direct, kernel=kernel, layout="pinhole") for kernel in kernels),
-    ]
-
-
-def list_main_choices(backend: str, height: int, threads: int) -> list[RasterCase]:
-    """The direct panorama, the stitched ones, and the options of the official code (`OFFICIAL`)."""
+    """The direct panorama, pinhole images, and the stitched panoramas, by each kernel that has them."""
     direct = RasterCase(backend, height, threads=threads)
-    stitched = replace(direct, layout="cubemap", face_size=default_face_size(height))
-    official = replace(
-        direct,
-        kernel=OFFICIAL.kernel,
-        order=OFFICIAL.order,
-        filter=OFFICIAL.lowpass,
-        layout="cubemap",
-        face_size=official_face_size(height),
-        stitching="seamless" if height % 4 else OFFICIAL.stitching,
-    )
-    cases = [direct, stitched, replace(stitched, kernel="ewa"), official]
-    return [case for case in cases if case.kernel in _kernels(backend)]
-
-
-def _kernels(backend: str) -> tuple[Kernel, ...]:
-    return ("ray",) if backend == "numba" else ("ray", "ewa")
+    pinhole, stitched = replace(direct, layout="pinhole"), replace(direct, layout="cubemap")
+    cases = [direct, pinhole, replace(stitched, face_size=default_face_size(height))]
+    if backend != "numba":
+        cases.append(replace(pinhole, kernel="ewa"))
+        if height % 4 == 0:
+            cases.append(replace(stitched, kernel="ewa", face_size=official_face_size(height)))
+    return cases
 
 
 def default_face_size(height: int) -> int:
@@ -387,8 +352,10 @@ def plot_choices(rows: Sequence[Row], header: Header) -> Figure | None:
         x, y = [row.get("forward_ms") for row in group], [min(_MAX_PSNR, row.get("psnr_db")) for row in group]
         axes.plot(x, y, _MARKERS[backend], label=f"{backend}, {layout}")
         for row, *point in zip(group, x, y, strict=True):
-            choice, above = " ".join(map(row.get, ("kernel", "order", "filter"))), len(axes.texts) % 2  # in turns
-            axes.annotate(choice, point, xytext=(6, 5 if above else -11), textcoords="offset points", fontsize=7)
+            above = len(axes.texts) % 2  # in turns
+            axes.annotate(
+                row.get("kernel"), point, xytext=(6, 5 if above else -11), textcoords="offset points", fontsize=7
+            )
     axes.set(xscale="log", xlabel="forward, milliseconds", ylabel=f"PSNR, dB (at most {_MAX_PSNR:g})")
     axes.set_title(
         f"{shown[0].get('scene')}: {_describe_size(shown[0])}; {header['machine']['cpu']}", loc="left", fontsize=9
@@ -407,8 +374,6 @@ RASTER = Suite(
     (
         Column("renderer", _describe_renderer),
         Column("kernel", "kernel"),
-        Column("order", "order"),
-        Column("filter", "filter"),
         Column("layout", "layout_name"),
         Column("height", "height", "d"),
         Column("Gaussians", "num_gaussians", ","),

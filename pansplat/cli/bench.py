@@ -69,7 +69,7 @@ class _Options(Writer):
 
 @dataclass(frozen=True)
 class BenchRaster(_Options):
-    """Measure the rasterisers: time and memory against error, for every choice of kernel, order, filter and faces."""
+    """Measure the rasterisers: time and memory against error, for every kernel and layout."""
 
     scene: Positional[Path | None] = None
     """A scene file, or the folder of a pair for `sweep`; by default a synthetic room, and the sample if it is there."""

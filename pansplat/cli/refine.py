@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -59,8 +58,6 @@ class Refine(Computation):
     """Estimate small corrections of the camera poses, too; with --layers."""
     seed: Seed = 0
     """Of the blocks of pixels that are held out to detect overfitting."""
-    report: Path | None = None
-    """A .json file for errors, gains, times and the error over the steps."""
     prediction: _Prediction = field(default_factory=_Prediction)
     choice: PairChoice = field(default_factory=PairChoice)
 
@@ -68,7 +65,6 @@ class Refine(Computation):
     def run(self) -> int:
         """Refine, write the scene and print the errors of held-out pixels."""
         from pansplat import pipeline
-        from pansplat.evaluation.results import write_json
         from pansplat.refinement import RefineConfig, fuse_views
 
         self._refuse_invalid_arguments()
@@ -88,8 +84,6 @@ class Refine(Computation):
                 should_stop=should_stop,
             )
             pipeline.save(refined, self.out)
-        if self.report is not None:
-            write_json(dataclasses.asdict(report), self.report)
         print(_describe(report, "all" if scene.joint else "held-out"))
         print(f"{self.out}: {len(refined.gaussians):,} Gaussians (given: {len(given.gaussians):,})")
         return 0
@@ -97,8 +91,6 @@ class Refine(Computation):
     def _refuse_invalid_arguments(self) -> None:
         """Raise an error before the prediction, which takes seconds."""
         require_output_file("--out", self.out, SCENE_SUFFIXES, overwrite=self.overwrite)
-        if self.report is not None:
-            require_output_file("--report", self.report, (".json",), overwrite=self.overwrite)
         if self.poses and not self.layers:
             raise InputError("--poses compares all Gaussians of each view with the photographs; add --layers")
         if self.seconds is not None and self.steps is not None:

@@ -95,18 +95,16 @@ def _draw_display_image() -> None:
     """Draw two layers and a view from cube faces as the viewer does without a GPU."""
     import numpy as np
 
-    from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels, enlarge
+    from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels
     from pansplat.rendering.cpu.tiling import radix_argsort
-    from pansplat.rendering.rasterize import RasterOptions
 
     scene = DisplayScene(*(np.ones(shape, np.float32) for shape in ((9, 3), 9, (9, 4), (9, 3), (9, 1, 3), 9)))
     faces, pixels = PixelFaces.allocate(7.0), np.zeros((16, 16), np.uint32)
     labels = np.arange(9, dtype=np.int16) % 2
     selection = Selection(np.eye(3), 0.01)
-    layers = scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, RasterOptions(), selection=selection)
+    layers = scene.rasterize(np.zeros(3), faces.plane(0), labels, 2, 0.05, selection=selection)
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), faces.pixels[0])
     blend_to_pixels(layers.sums, np.full(2, 0.5), (0.0, 0.0, 0.0), pixels, bottom_up=True)
-    enlarge(faces.pixels[0], np.zeros((24, 24), np.uint32))
     faces.sample(np.eye(3), 20.0, pixels)
     radix_argsort(np.ones(9, np.float32))
 

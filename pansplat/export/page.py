@@ -42,7 +42,7 @@ from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
-from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering.color_fit import fit_colors
 from pansplat.rendering.image_planes import image_planes
 from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
@@ -386,7 +386,7 @@ def _merge_part(scene: Scene, count: int, steps: int) -> Scene:
     for step in range(steps):
         refinement.step(step / steps)
     merged = refinement.scene()
-    fitted = fit_colors(merged.gaussians, views.images, views.cam2world, views.masks, ColorFitConfig())
+    fitted = fit_colors(merged.gaussians, views.images, views.cam2world, views.masks)
     return dataclasses.replace(merged, gaussians=fitted)
 
 
@@ -477,7 +477,7 @@ def _describe_scene(
         "near": constants.NEAR,
         "unit": 1 / scene.frame.unit,
         "tallest": _TALLEST,
-        "filterVariance": constants.FILTER_VARIANCE["angular"],
+        "filterVariance": constants.FILTER_VARIANCE,
         "speed": _SPEED * float(np.median(reaches)),
         "limits": _limit_parts(reaches, positions, flights, len(tour)),
     }

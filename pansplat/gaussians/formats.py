@@ -38,6 +38,7 @@ from pansplat.gaussians.scene_files import (
     select_finite,
     sort_by_label,
 )
+from pansplat.geometry.morton import morton_codes
 from pansplat.system.atomic import replacing
 from pansplat.system.files import find_scene_suffix, read_file, require_file
 
@@ -236,13 +237,8 @@ def _find_place(gaussians: Gaussians) -> np.ndarray:
     means = gaussians.means.detach().cpu().numpy().astype(np.float32)
     low, extent = means.min(axis=0), np.ptp(means, axis=0)
     steps = np.where(extent > 1e-8, np.float32(2097151) / np.maximum(extent, np.float32(1e-30)), np.float32(0))
-    cells = np.minimum(((means - low) * steps).astype(np.uint64), np.uint64(2097151))
-    for shift, mask in (
-        (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):  # fmt: skip
-        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
-    return cells[:, 0] | (cells[:, 1] << np.uint64(1)) | (cells[:, 2] << np.uint64(2))
+    cells = np.minimum(((means - low) * steps).astype(np.int64), 2097151)
+    return morton_codes(cells)
 
 
 # The pansplat entry of each format

@@ -20,26 +20,17 @@ _MIN_DISTANCE = 1e-6  # metres
 _SPLIT_SHIFT, _SPLIT_SCALE = 0.5, 0.7  # of the halves of a split Gaussian along its longest axis, relative to its scale
 
 
-@dataclasses.dataclass(frozen=True)
-class LearningRates:
-    """Step sizes of Adam at the start of a refinement; they fall to a fraction along a cosine."""
-
-    distance: float = 0.008
-    """Of the logarithm of the distance from the source camera."""
-    scale: float = 0.24
-    """Of the logarithms of the scales."""
-    rotation: float = 0.04
-    """Of the unit quaternions."""
-    opacity: float = 0.12
-    """Of the logits of the opacities."""
-    color: float = 0.02
-    """Of the harmonics of degree 0."""
-    harmonics: float = 0.002
-    """Of the harmonics of higher degree."""
-    gain: float = 0.01
-    """Of the logarithms of the photographs' gains."""
-    pose: float = 0.0005
-    """Of the cameras' rotations, radians, and of their positions relative to the baseline."""
+LEARNING_RATES = {
+    "distance": 0.008,  # of the logarithm of the distance from the source camera
+    "scale": 0.24,  # of the logarithms of the scales
+    "rotation": 0.04,  # of the unit quaternions
+    "opacity": 0.12,  # of the logits of the opacities
+    "color": 0.02,  # of the harmonics of degree 0
+    "harmonics": 0.002,  # of the harmonics of higher degree
+    "gain": 0.01,  # of the logarithms of the photographs' gains
+    "pose": 0.0005,  # of the cameras' rotations, radians, and of their positions relative to the baseline
+}
+"""Step sizes of Adam at the start of a refinement; they fall to a fraction along a cosine."""
 
 
 class ViewParameters:

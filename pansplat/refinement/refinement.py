@@ -19,7 +19,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -33,9 +33,9 @@ from pansplat.inputs.views import Views
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
 from pansplat.refinement.objective import Photograph, image_difference
-from pansplat.refinement.parameters import CameraParameters, LearningRates, ViewParameters
+from pansplat.refinement.parameters import LEARNING_RATES, CameraParameters, ViewParameters
 from pansplat.rendering import rasterize
-from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering.color_fit import count_steps, fit_colors
 from pansplat.rendering.weights import compute_blending_weights
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
@@ -53,8 +53,10 @@ _BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # size; it grows with the number of their pixels. Gaussians of little effect move less.
 _DAMPING = 0.2
 _STEPS_SHARE = 0.65  # of the time, that the steps take; the rest is the fit of colours (the sample on two cores)
-_COLORS = ColorFitConfig()
 _RATE_FLOOR = 0.05  # of the learning rates at the end
+_HOLD = 20.0  # weight of the mean squared change of the logarithms of distances
+_POSE_HOLD = 100.0  # weight of the squared corrections of poses, in radians and relative to the baseline
+_RELEASE = 0.75  # fraction of the run after which held-out blocks are fitted too
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
 # Of a timed run: with a limit of Gaussians (merged ones that are not fitted look like dots), and for each photograph in
 # joint drawing (few large steps leave the scene worse than before).
@@ -69,17 +71,10 @@ _POSE_TOLERANCE = 1e-3  # between the entries of the poses of scene and photogra
 class RefineConfig:
     """Settings of a refinement."""
 
-    rates: LearningRates = field(default_factory=LearningRates)
     gaussians: int | None = None
     """Largest number of Gaussians; None for no limit."""
-    hold: float = 20.0
-    """Weight of the mean squared change of the logarithms of distances."""
     poses: bool = False
     """Whether small corrections of the poses are estimated."""
-    pose_hold: float = 100.0
-    """Weight of the squared corrections, in radians and relative to the baseline."""
-    release: float = 0.75
-    """Fraction of the run after which held-out blocks are fitted too."""
     splits: tuple[float, ...] = (0.2, 0.4)
     """Fractions of the run at which Gaussians are split."""
 
@@ -98,8 +93,6 @@ class RefineReport:
             which is not refined.
         before: mean absolute error of the held-out blocks at the start, of the scene within the limit of Gaussians.
         after: the same before the last part of the run, which fits these blocks, or at the end of a run without it.
-        gains: factors of the photographs' channels relative to their geometric mean.
-        history: (step, seconds, error of the held-out blocks) of each check.
     """
 
     steps: int
@@ -107,8 +100,6 @@ class RefineReport:
     stopped: str
     before: float
     after: float
-    gains: Gains
-    history: tuple[tuple[int, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -183,7 +174,7 @@ class Refinement:
 
     def _group_parameters(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
         """All groups, and those of them that hold the Gaussians: one for each of `ViewParameters.NAMES`."""
-        rates, betas = dataclasses.asdict(self.config.rates), _POSE_BETAS if self.config.poses else _BETAS
+        rates, betas = LEARNING_RATES, _POSE_BETAS if self.config.poses else _BETAS
         groups = [ParameterGroup([self._cameras.log_gains], rates["gain"], betas)]
         if self.config.poses:
             groups.append(ParameterGroup([self._cameras.twists], rates["pose"], betas))
@@ -199,7 +190,7 @@ class Refinement:
             fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
         """
         config = self.config
-        if self._splits < len(config.splits) and config.splits[self._splits] <= fraction < config.release:
+        if self._splits < len(config.splits) and config.splits[self._splits] <= fraction < _RELEASE:
             self._splits += 1
             self._split()
         for group in self._groups:
@@ -208,7 +199,7 @@ class Refinement:
         for layer in self._layers:
             target = self._choose_target(layer)
             photograph = self._photographs[target]
-            weights = photograph.unmasked if fraction >= config.release else photograph.fitted
+            weights = photograph.unmasked if fraction >= _RELEASE else photograph.fitted
             gaussians = self._build(layer)
             moved = torch.cat([self._views[view].tensors["distance"] for view in layer.views])
             if layer.source is None:
@@ -216,9 +207,9 @@ class Refinement:
                 gaussians, moved = gaussians.select(seen), moved[seen]
                 rows = seen.split([len(parameters) for parameters in self._views.values()])
             error = self._draw(gaussians, layer, target) - photograph.image
-            (image_difference(error, weights) + config.hold * moved.square().mean()).backward()
+            (image_difference(error, weights) + _HOLD * moved.square().mean()).backward()
         if config.poses:
-            (config.pose_hold * self._cameras.twists.square().sum()).backward()
+            (_POSE_HOLD * self._cameras.twists.square().sum()).backward()
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         for group in self._groups:
             group.clean_gradients()
@@ -353,18 +344,12 @@ class Refinement:
         min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
         if self._start.joint:
             min_steps = _MIN_STEPS * len(self._photographs)
-        clock = _Clock(seconds, steps, self.config.release, self._created, min_steps)
-        history: list[tuple[int, float, float]] = []
+        clock = _Clock(seconds, steps, self._created, min_steps)
         if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
             self._result, error = self._start, self.held_out_error()
-            return RefineReport(0, clock.elapsed, "single view", error, error, self._start.gains, ())
+            return RefineReport(0, clock.elapsed, "single view", error, error)
 
-        def measure() -> float:
-            error = self.held_out_error()
-            history.append((clock.steps, clock.elapsed, error))
-            return error
-
-        before = best = measure()
+        before = best = self.held_out_error()
         after: float | None = None  # measured when the release begins, which fits the held-out blocks
         fastest, stale, stopped = math.inf, 0, "done"
         while self._views and (fraction := clock.fraction) < 1:
@@ -372,8 +357,8 @@ class Refinement:
                 stopped = "interrupted"
                 break
             report_progress("refining", _STEPS_SHARE * fraction)
-            if after is None and fraction >= self.config.release and not self._start.joint:
-                after = measure()
+            if after is None and fraction >= _RELEASE and not self._start.joint:
+                after = self.held_out_error()
             if after is not None and after > before:
                 break
             start = clock.elapsed
@@ -381,15 +366,15 @@ class Refinement:
             clock.steps += 1
             fastest = min(fastest, clock.elapsed - start)  # the first step of a process loads kernels
             clock.reserve(self._end_cost() * fastest)
-            if self._start.joint or clock.steps % _CHECK_EVERY or clock.fraction >= self.config.release:
+            if self._start.joint or clock.steps % _CHECK_EVERY or clock.fraction >= _RELEASE:
                 continue
-            error = measure()
+            error = self.held_out_error()
             stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
             best = min(best, error)
             if stale >= _PATIENCE:
                 stopped, after = "converged", error
                 clock.shorten()
-        after = measure() if after is None else after
+        after = self.held_out_error() if after is None else after
         report_progress("fitting colours", _STEPS_SHARE)
         self._result = self.scene() if after <= before else self._start
         self._free_parameters()
@@ -401,7 +386,7 @@ class Refinement:
         if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)
         report_progress("refined", 1.0)
-        return RefineReport(clock.steps, clock.elapsed, stopped, before, after, self.gains, tuple(history))
+        return RefineReport(clock.steps, clock.elapsed, stopped, before, after)
 
     def _free_parameters(self) -> None:
         """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""
@@ -420,7 +405,7 @@ class Refinement:
         gradient = 1.7  # of a backward pass
         weights, product = 1.2, 0.5  # of blending weights, and of a product with them
         contributions = (others + views) * (weights + product)
-        steps = _COLORS.steps_at(self._images.shape[-2])
+        steps = count_steps(self._images.shape[-2])
         colors = views * pixels * (weights + product + 2 * steps * product)
         return (contributions + colors) / (layers * (1 + gradient))
 
@@ -429,7 +414,7 @@ class Refinement:
         images = self._images
         if scene.joint and scene.gains:
             images = images / torch.tensor(scene.gains).to(images)[:, :, None, None]
-        colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, _COLORS, joint=scene.joint)
+        colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, joint=scene.joint)
         return dataclasses.replace(scene, gaussians=colors)
 
 
@@ -437,20 +422,17 @@ class _Clock:
     """The completed fraction of a run, in steps or in seconds.
 
     Args:
-        release: fraction at which the last part begins.
         start: time from which seconds count, by `time.perf_counter`.
         min_steps: of a timed run, which takes longer for them.
     """
 
-    def __init__(
-        self, seconds: float | None, steps: int | None, release: float, start: float, min_steps: int = 0
-    ) -> None:
+    def __init__(self, seconds: float | None, steps: int | None, start: float, min_steps: int = 0) -> None:
         limit = seconds if steps is None else steps
         if limit is None or (seconds is not None and steps is not None):
             raise InputError("give either `seconds` or `steps` of a refinement, got both or neither")
         if not 0 < limit < math.inf:
             raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
-        self._is_timed, self._given, self._release = steps is None, float(limit), release
+        self._is_timed, self._given = steps is None, float(limit)
         self._limit, self._is_shortened, self._reached = self._given, False, 0.0
         self.steps, self._start, self._min_steps = 0, start, min_steps
 
@@ -479,7 +461,7 @@ class _Clock:
 
     def shorten(self) -> None:
         """Begin the last part now, with a length in proportion to the time that was spent."""
-        self._limit, self._is_shortened = self._spent / self._release, True
+        self._limit, self._is_shortened = self._spent / _RELEASE, True
 
 
 def _cosine_fall(fraction: float) -> float:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,24 +23,17 @@ from pansplat.gaussians.harmonics import SH_0, harmonics_basis
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.weights import BlendingWeights, compute_blending_weights
 
+_STEPS = 4  # for photographs of up to 1024 rows
+_RELAXATION = 1.8  # converges below 2
 _MIN_COVERAGE = 1e-3  # pixels
 _STORED = 2  # photographs whose weights are kept between the steps; those of one take 200 MB at 512 rows
 
 
-@dataclass(frozen=True)
-class ColorFitConfig:
-    """Settings of the fit of colours."""
-
-    steps: int = 4
-    """For photographs of up to 1024 rows."""
-    relaxation: float = 1.8
-    """Converges below 2."""
-
-    def steps_at(self, height: int) -> int:
-        """Steps for photographs of a height: the number of Gaussians is limited, so that one covers more pixels of a
-        large photograph, and the iteration converges later.
-        """
-        return self.steps * max(1, height // 1024)
+def count_steps(height: int) -> int:
+    """Steps for photographs of a height: the number of Gaussians is limited, so that one covers more pixels of a large
+    photograph, and the iteration converges later.
+    """
+    return _STEPS * max(1, height // 1024)
 
 
 def fit_colors(
@@ -49,7 +41,6 @@ def fit_colors(
     images: Float[Tensor, "view 3 height width"],
     cam2world: Float[Tensor, "view 4 4"],
     masks: Bool[Tensor, "view height width"],
-    config: ColorFitConfig,
     *,
     joint: bool = False,
 ) -> Gaussians:
@@ -71,12 +62,12 @@ def fit_colors(
     harmonics = gaussians.harmonics.clone()
     for chosen, compared in groups:
         if chosen.any():
-            harmonics[chosen, 0] = _fit(gaussians.select(chosen), compared, config)
+            harmonics[chosen, 0] = _fit(gaussians.select(chosen), compared)
     return dataclasses.replace(gaussians, harmonics=harmonics)
 
 
 @torch.no_grad()
-def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tensor]], config: ColorFitConfig) -> Tensor:
+def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
     """The harmonics of degree 0 (n, 3) of Gaussians that are drawn together.
 
     Args:
@@ -95,13 +86,13 @@ def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tenso
     for number, (*_, mask) in enumerate(photographs):
         coverage += look(number)[0].accumulate(mask[None].to(change))
     coverage.clamp_min_(_MIN_COVERAGE)
-    for _ in range(config.steps_at(photographs[0][0].shape[-2])):
+    for _ in range(count_steps(photographs[0][0].shape[-2])):
         total = torch.zeros_like(change)
         for number, (image, _, mask) in enumerate(photographs):
             weights, colors = look(number)
             drawn = weights.blend((colors + change).clamp_min(0))
             total += weights.accumulate((image.to(change) - drawn) * mask.to(change))
-        change += config.relaxation * total / coverage
+        change += _RELAXATION * total / coverage
     return gaussians.harmonics[:, 0] + change / SH_0
 
 

@@ -17,7 +17,6 @@ from pansplat.geometry.cubemap import FACES, face_of, face_rotations, official_f
 from pansplat.geometry.equirect import pixel_directions
 
 Layout = Literal["equirect", "cubemap", "pinhole"]
-Stitching = Literal["seamless", "official"]
 
 _UP, _DOWN = FACES.index("up"), FACES.index("down")
 
@@ -123,21 +122,21 @@ class _Lookup(NamedTuple):
 
 
 def stitch_faces(
-    faces: Float[Tensor, "face channel n n"], size: tuple[int, int], *, stitching: Stitching = "seamless"
+    faces: Float[Tensor, "face channel n n"], size: tuple[int, int], *, official: bool = False
 ) -> Float[Tensor, "channel height width"]:
     """Stitch a panorama from six cube faces. It is linear in every face, so panoramas of single faces can be added.
 
     Args:
         faces: in the order of `FACES`.
         size: height and width of the panorama, pixels.
-        stitching: "seamless" pads each face with its true neighbours; "official" reproduces the official code's wrong
-            padding at the left and right edges of the up and down faces, and its outline of these faces.
+        official: with the official code's wrong padding at the left and right edges of the up and down faces, and its
+            outline of these faces. Otherwise each face is padded with its true neighbours.
 
     Raises:
-        ValueError: "official", and the size is not 2:1 or its height is not a multiple of 4.
+        ValueError: `official`, and the size is not 2:1 or its height is not a multiple of 4.
     """
     num, channels = faces.shape[-1], faces.shape[1]
-    lookup = _Lookup(*(table.to(faces.device) for table in _compute_lookup(num, size, stitching)))
+    lookup = _Lookup(*(table.to(faces.device) for table in _compute_lookup(num, size, official)))
     flat = faces.permute(1, 0, 2, 3).reshape(channels, -1)
     flat = torch.cat((flat, flat.new_zeros(channels, 1)), dim=1)
     # At the corners of the cube three pixels meet; elsewhere all three indices are of the same pixel.
@@ -156,13 +155,13 @@ def _interpolate_row(
 
 @functools.lru_cache(maxsize=2)
 @torch.inference_mode(False)  # the cached tensors are also used in calls that need gradients
-def _compute_lookup(num: int, size: tuple[int, int], stitching: Stitching) -> _Lookup:
+def _compute_lookup(num: int, size: tuple[int, int], official: bool) -> _Lookup:
     rotations = face_rotations()
     directions = pixel_directions(*size, dtype=torch.float64).reshape(-1, 3)
     border = _find_border_pixels(num)
-    if stitching == "official":
+    if official:
         if size[1] != 2 * size[0]:
-            raise ValueError(f"`size` must be 2:1 for stitching 'official', got {size}")
+            raise ValueError(f"`size` must be 2:1 for the official stitching, got {size}")
         face = official_faces(size[0]).reshape(-1)
         border = _apply_official_padding(border, num)
     else:

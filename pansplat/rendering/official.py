@@ -13,10 +13,7 @@ from torch import Tensor
 from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.rasterize import Backend, RasterOptions, Rendering, rasterize
-
-OFFICIAL = RasterOptions(kernel="ewa", order="z", lowpass="3dgs", stitching="official")
-"""The official code's options; a pinhole image or a single face needs stitching="seamless"."""
+from pansplat.rendering.rasterize import Backend, Rendering, rasterize
 
 
 def official_face_size(height: int) -> int:
@@ -37,7 +34,7 @@ def rasterize_official(
     near: float,
     backend: Backend = "auto",
 ) -> Rendering:
-    """Rasterise a panorama with `OFFICIAL`, stitched from six faces of half its height.
+    """Rasterise a panorama by the official kernel, stitched from six faces of half its height.
 
     Args:
         cam2world: pose of the camera, OpenCV axes, metres.
@@ -53,5 +50,6 @@ def rasterize_official(
         layout="cubemap",
         face_size=official_face_size(size[0]),
         backend=backend,
-        **vars(replace(OFFICIAL, near=EWA_NEAR_FACTOR * near)),
+        kernel="ewa",
+        near=EWA_NEAR_FACTOR * near,
     )

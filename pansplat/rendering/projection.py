@@ -6,8 +6,7 @@ compositing reads have the Gaussians' type.
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 from pansplat.constants import (
     ALPHA_CUT,
     EWA_CLAMP,
+    EWA_DILATION,
     KAPPA_MARGIN,
     MAX_MAGNITUDE,
     MAX_SCALE_RATIO,
@@ -37,49 +37,21 @@ _UNBOUNDED = 1e9  # pixels, far outside any image
 # --- selection: the Gaussians that are finite, far enough and opaque enough ---
 
 
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """The Gaussians to project, and the number of the others.
-
-    Attributes:
-        total: number of Gaussians before the selection.
-        dropped: number of Gaussians that are not finite.
-        near: number of Gaussians nearer than `near`.
-    """
-
-    gaussians: Gaussians
-    total: int
-    dropped: int
-    near: int
-
-
-def select_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], options: RasterOptions) -> Selection:
+def select_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], near: float) -> Gaussians:
     """Select Gaussians before any arithmetic, so that the gradients of all others are exactly zero."""
-    radius = _compute_radius(gaussians, pose)
-    close = radius < options.near
-    usable = _are_usable(gaussians, radius, close)
-    dropped = len(gaussians) - int(usable.sum())
-    close &= usable
-    keep = usable & ~close & (gaussians.opacities.detach() >= OPACITY_CUT)
-    total, near = len(gaussians), int(close.sum())
-    if not bool(keep.all()):
-        gaussians = gaussians.select(keep)
-    return Selection(gaussians, total, dropped, near)
+    keep = _are_drawable(gaussians, pose, near)
+    return gaussians if bool(keep.all()) else gaussians.select(keep)
 
 
 @torch.no_grad()
-def _compute_radius(gaussians: Gaussians, pose: Tensor) -> Float[Tensor, "n"]:
-    return torch.linalg.vector_norm(gaussians.means.double() - pose[:3, 3], dim=1)
-
-
-@torch.no_grad()
-def _are_usable(gaussians: Gaussians, radius: Tensor, close: Tensor) -> Bool[Tensor, "n"]:
-    """Which Gaussians have finite numbers only, small enough for their products, and are not too large."""
-    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+def _are_drawable(gaussians: Gaussians, pose: Float[Tensor, "4 4"], near: float) -> Bool[Tensor, "n"]:
+    radius = torch.linalg.vector_norm(gaussians.means.double() - pose[:3, 3], dim=1)
+    keep = (radius >= near) & (gaussians.opacities >= OPACITY_CUT)
+    # Finite numbers only, small enough for their products, and not too large for the distance.
     for name in ("means", "scales", "quats", "opacities", "harmonics"):
         field = getattr(gaussians, name)
-        keep &= (field.detach().abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
-    return keep & (close | (gaussians.scales.detach().double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius))
+        keep &= (field.abs() < MAX_MAGNITUDE).reshape(len(keep), max(1, field[:1].numel())).all(dim=1)
+    return keep & (gaussians.scales.double().abs().amax(dim=1) <= MAX_SCALE_RATIO * radius)
 
 
 # --- projection: Gaussians in the axes of one camera ---
@@ -112,7 +84,6 @@ def project_gaussians(
     cam2world: Float[Tensor, "4 4"],
     *,
     filter_variance: float,
-    compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
     """Project Gaussians in chunks; under autograd, backward recomputes each chunk to bound the memory.
@@ -121,12 +92,10 @@ def project_gaussians(
         gaussians: selected by `select_drawable`.
         cam2world: float64.
         filter_variance: e^2, added across the ray, radians^2.
-        compensate: lower the opacity so that the filter does not add energy.
-        exact: compute the rows of the exact kernel.
+        exact: compute the rows of the exact kernel, and lower the opacity so that the filter does not add energy.
     """
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, gaussians.quats, gaussians.scales)
-    options: Any = dict(cam2world=cam2world, filter_variance=filter_variance, compensate=compensate, exact=exact)
-    project = functools.partial(_project_chunk, **options)
+    project = functools.partial(_project_chunk, cam2world=cam2world, filter_variance=filter_variance, exact=exact)
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*fields, cam2world))
     parts = []
     for chunk in zip(*(field.split(_CHUNK_SIZE) for field in fields), strict=True):
@@ -143,7 +112,6 @@ def _project_chunk(
     *,
     cam2world: Float[Tensor, "4 4"],
     filter_variance: float,
-    compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
     """Project one chunk of `project_gaussians`."""
@@ -159,12 +127,11 @@ def _project_chunk(
     covariance = unfiltered.covariance + filter_variance * (
         torch.eye(3, dtype=torch.float64, device=means.device) - outer
     )
-    det_filtered = unfiltered.det_across + filter_variance * unfiltered.trace_across + filter_variance**2
     peak = opacities.double()
-    if compensate:
-        peak = peak * torch.sqrt((unfiltered.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
     rows, radial_variance = covariance.new_zeros(len(means), 0, 3), torch.zeros_like(radius)
     if exact:
+        det_filtered = unfiltered.det_across + filter_variance * unfiltered.trace_across + filter_variance**2
+        peak = peak * torch.sqrt((unfiltered.det_across / det_filtered).clamp_min(MIN_COMPENSATION))
         radial_variance = (
             filter_variance**2 * unfiltered.radial_variance + filter_variance * unfiltered.mixed + unfiltered.det
         )
@@ -274,7 +241,7 @@ def compute_footprints(
 ) -> tuple[Footprints, Float[Tensor, "n 4"]]:
     """Compute footprints on an image plane, and their bounding boxes (left, right, top, bottom; pixels)."""
     if options.kernel == "ewa":
-        footprints, variances = ewa_footprints(projected, plane.rotation, plane.size, plane.focal, options.dilation)
+        footprints, variances = ewa_footprints(projected, plane.rotation, plane.size, plane.focal)
         return footprints, ewa_boxes(footprints.point.detach(), variances, kappa(projected.peak.detach()))
     kappas, direction = kappa(projected.peak.detach()), projected.direction.detach()
     covariance = projected.covariance.detach()
@@ -291,7 +258,7 @@ def ray_footprints(projected: ProjectedGaussians) -> Footprints:
 
 
 def ewa_footprints(
-    projected: ProjectedGaussians, rotation: Float[Tensor, "3 3"], size: tuple[int, int], focal: float, dilation: float
+    projected: ProjectedGaussians, rotation: Float[Tensor, "3 3"], size: tuple[int, int], focal: float
 ) -> tuple[Footprints, Float[Tensor, "n 2"]]:
     """Compute EWA footprints on a pinhole image, with points in pixels, and their variances in x and y.
 
@@ -300,7 +267,6 @@ def ewa_footprints(
         rotation: the image plane's axes in camera axes.
         size: height and width, pixels.
         focal: pixels.
-        dilation: variance added on both axes, pixels^2.
     """
     height, width = size
     dtype = projected.peak.dtype
@@ -314,7 +280,7 @@ def ewa_footprints(
     rows = torch.stack((one, zero, -clamped_x, zero, one, -clamped_y), dim=1).reshape(-1, 2, 3)
     jacobian = rows * (focal / z)[:, None, None]
     v = jacobian @ covariance @ jacobian.transpose(1, 2)
-    v_xx, v_xy, v_yy = v[:, 0, 0] + dilation, v[:, 0, 1], v[:, 1, 1] + dilation
+    v_xx, v_xy, v_yy = v[:, 0, 0] + EWA_DILATION, v[:, 0, 1], v[:, 1, 1] + EWA_DILATION
     across = (v_yy - v_xy * v_xy / v_xx).clamp_min(MIN_EWA_VARIANCE)
     first = torch.stack((1 / torch.sqrt(v_xx), zero, zero), dim=1)
     second = torch.stack((-v_xy / v_xx, one, zero), dim=1) / torch.sqrt(across)[:, None]

@@ -1,4 +1,4 @@
-"""The function `rasterize`: options, arguments, the protocol of backends, background and normalisation.
+"""The function `rasterize`: options, arguments, the type of backends, background and normalisation.
 
 Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there are several backends.
 """
@@ -6,8 +6,8 @@ Source: docs/rendering.md; PanSplat, section 3.4; docs/adr/0005 for why there ar
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
+from dataclasses import dataclass
+from typing import Literal, ParamSpec, TypeVar, get_args
 
 import torch
 from jaxtyping import Float
@@ -17,13 +17,11 @@ from pansplat.constants import FILTER_VARIANCE, NEAR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import orthonormal_error
-from pansplat.rendering.image_planes import ImagePlane, Layout, Stitching, image_planes, stitch_faces
+from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes, stitch_faces
 from pansplat.system.descriptions import describe_count, describe_range
 from pansplat.system.devices import find_triton_problem
 
 Kernel = Literal["ray", "ewa"]
-Order = Literal["radial", "z"]
-Lowpass = Literal["angular", "3dgs"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
 MAX_EYE_OFFSET = 1e6  # metres
@@ -37,111 +35,33 @@ _R = TypeVar("_R")
 class RasterOptions:
     """Options of an image, apart from scene, camera and layout.
 
-    `pansplat.rendering.official.OFFICIAL` holds the options of the official code.
-
     Attributes:
-        kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces.
-        order: sort by distance, or by depth along each image plane's optical axis as 3DGS does.
-        lowpass: "angular" conserves energy; "3dgs" adds 0.3 pixel^2.
+        kernel: "ray" is exact; "ewa" is the approximation of 3DGS, for pinhole images and cube faces, with the low-pass
+            filter, the order by depth, and the stitching of cube faces of the official code.
         near: Gaussians whose mean is nearer are not rasterised, metres.
-        stitching: of cube faces, "seamless", or "official" with the borders of the official code.
     """
 
     kernel: Kernel = "ray"
-    order: Order = "radial"
-    lowpass: Lowpass = "angular"
     near: float = NEAR
-    stitching: Stitching = "seamless"
 
     def __post_init__(self) -> None:
         _check_choice("kernel", self.kernel, Kernel)
-        _check_choice("order", self.order, Order)
-        _check_choice("lowpass", self.lowpass, Lowpass)
-        _check_choice("stitching", self.stitching, Stitching)
         if not 0 < self.near < math.inf:
             raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
 
     def filter_variance(self, pixel_angle: float) -> float:
         """e^2 of docs/rendering.md: the variance added across the ray, radians^2."""
-        return FILTER_VARIANCE[self.lowpass] * pixel_angle**2 if self._filters_across_ray else 0.0
-
-    @property
-    def compensate(self) -> bool:
-        """Whether the opacity is lowered by as much as the filter widens a Gaussian."""
-        return self.lowpass == "angular"
-
-    @property
-    def dilation(self) -> float:
-        """Variance added to the projected covariance, pixels^2."""
-        return 0.0 if self._filters_across_ray else FILTER_VARIANCE[self.lowpass]
-
-    @property
-    def _filters_across_ray(self) -> bool:
-        return self.compensate or self.kernel == "ray"
+        return FILTER_VARIANCE * pixel_angle**2 if self.kernel == "ray" else 0.0
 
 
-@dataclass(frozen=True)
-class RasterInfo:
-    """Counts and costs of one call.
+RasterBackend = Callable[
+    [Gaussians, Float[Tensor, "4 4"], list[ImagePlane], RasterOptions], Float[Tensor, "plane sums height width"]
+]
+"""A backend's `rasterize_planes`: sums along each pixel's ray of weight x (channels, radial distance, 1).
 
-    Attributes:
-        total: Gaussians given.
-        dropped: Gaussians with a number that is not finite or too large, or a covariance that is not positive.
-        near: Gaussians nearer than `near`; with an eye offset, to the point between the eyes.
-        visible: Gaussians that can reach the alpha cut in the image; summed over the faces of a cubemap, and
-            over the columns of a panorama with an eye offset.
-        intersections: pairs of a Gaussian and a raster tile.
-        backend: its name.
-        bytes: peak working memory, where the backend counts it.
-        seconds: time of each stage, where the backend measures it.
-    """
-
-    total: int
-    dropped: int
-    near: int
-    visible: int
-    intersections: int
-    backend: str = "torch"
-    bytes: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class RasterSums:
-    """Image planes before background and normalisation.
-
-    Attributes:
-        sums: sums along each pixel's ray of weight x (channels, radial distance, 1).
-        info: counts over all the image planes.
-    """
-
-    sums: Float[Tensor, "plane sums height width"]
-    info: RasterInfo
-
-
-@runtime_checkable
-class RasterBackend(Protocol):
-    """Signature of a backend's `rasterize_planes`.
-
-    Differentiable in the pose and in all floating-point fields of the Gaussians.
-    """
-
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        pose: Float[Tensor, "4 4"],
-        planes: list[ImagePlane],
-        options: RasterOptions,
-    ) -> RasterSums:
-        """Rasterise Gaussians on every image plane.
-
-        Args:
-            gaussians: float32 or float64.
-            pose: cam2world, float64, rigid.
-            planes: of one size and focal length; a panorama with an eye offset is the only one.
-            options: `stitching` is not used.
-        """
-        ...
+It is differentiable in the pose (cam2world, float64, rigid) and in all floating-point fields of the Gaussians (float32
+or float64). The image planes have one size and focal length; a panorama with an eye offset is the only one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,14 +72,12 @@ class Rendering:
         color: the Gaussians' channels (RGB) over the background; not clamped to 1.
         alpha: opacity in [0, 1].
         depth: mean radial distance, weighted as the colours are, metres; 0 where alpha is 0.
-        info: counts; None for an image that `rasterize` did not return.
         background: behind the Gaussians; None for black.
     """
 
     color: Float[Tensor, "channel height width"]
     alpha: Float[Tensor, "height width"]
     depth: Float[Tensor, "height width"]
-    info: RasterInfo | None = None
     background: Float[Tensor, "channel"] | None = None
 
     def __repr__(self) -> str:
@@ -199,10 +117,7 @@ def rasterize(
     background: Sequence[float] | Float[Tensor, "channel"] = (0.0, 0.0, 0.0),
     backend: Backend = "auto",
     kernel: Kernel = "ray",
-    order: Order = "radial",
-    lowpass: Lowpass = "angular",
     near: float = NEAR,
-    stitching: Stitching = "seamless",
 ) -> Rendering:
     """Rasterise Gaussians as one camera sees them.
 
@@ -218,14 +133,14 @@ def rasterize(
         eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
             distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
-        backend: "torch" is the reference, "numba" is fast on a CPU (kernel "ray" only), "triton" on CUDA; "auto"
-            chooses the fastest available for the kernel and the Gaussians' type and device.
-        kernel, order, lowpass, near, stitching: see `RasterOptions`.
+        backend: "torch" is the reference, "numba" fast on a CPU (kernel "ray", three channels), "triton" on CUDA;
+            "auto" chooses the fastest available for the kernel, and the Gaussians' type, channels and device.
+        kernel, near: see `RasterOptions`.
 
     Returns:
         The image, in the Gaussians' type.
     """
-    options = RasterOptions(kernel, order, lowpass, near, stitching)
+    options = RasterOptions(kernel, near)
     _check_arguments(size, layout, vertical_fov_degrees, face_size, eye_offset, backend, options)
     device = gaussians.means.device
     pose = torch.as_tensor(cam2world, device=device).double()
@@ -246,18 +161,17 @@ def rasterize(
         eye_offset=eye_offset,
         device=device,
     )
-    result = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
-    sums = result.sums.squeeze(0)
-    if layout == "cubemap":
-        sums = stitch_faces(result.sums, size, stitching=options.stitching)
-    return _normalise_sums(sums, background_color, result.info)
+    sums = _select_backend(backend, gaussians, options.kernel)(gaussians, pose, planes, options)
+    sums = stitch_faces(sums, size, official=kernel == "ewa") if layout == "cubemap" else sums.squeeze(0)
+    return normalise_sums(sums, background_color)
 
 
 def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> RasterBackend:
-    """Select the backend of this name; "auto" chooses by the kernel and the Gaussians' type and device."""
+    """Select the backend of this name; "auto" chooses by the kernel, and the Gaussians' type, channels and device."""
     if name == "auto":
         on_cpu = gaussians.means.device.type == "cpu"
-        available = kernel == "ray" if on_cpu else gaussians.means.is_cuda and find_triton_problem() is None
+        has_numba = on_cpu and kernel == "ray" and gaussians.harmonics.shape[2] == 3
+        available = has_numba if on_cpu else gaussians.means.is_cuda and find_triton_problem() is None
         fast: Backend = "numba" if on_cpu else "triton"
         name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     if name == "numba":
@@ -302,10 +216,10 @@ def _check_arguments(
             "kernel 'ewa' approximates a pinhole projection and is not defined on layout 'equirect'; "
             "use layout='cubemap', or kernel='ray'"
         )
-    if options.stitching == "official" and (layout != "cubemap" or size[0] % 4 or size[1] != 2 * size[0]):
+    if options.kernel == "ewa" and layout == "cubemap" and (size[0] % 4 or size[1] != 2 * size[0]):
         raise InputError(
-            "stitching 'official' needs layout='cubemap' and a 2:1 panorama with a height that is a multiple of 4, "
-            f"got layout={layout!r} and size {tuple(size)}; use stitching='seamless'"
+            "kernel 'ewa' on layout 'cubemap' needs a 2:1 panorama with a height that is a multiple of 4, got size "
+            f"{tuple(size)}; choose another size, or use kernel='ray'"
         )
 
 
@@ -325,9 +239,7 @@ def _convert_background(given: Sequence[float] | Tensor, gaussians: Gaussians) -
     return color
 
 
-def _normalise_sums(
-    sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None, info: RasterInfo
-) -> Rendering:
+def normalise_sums(sums: Float[Tensor, "sums height width"], background: Float[Tensor, "channel"] | None) -> Rendering:
     """Composite over the background, and divide the sum of distances by the sum of weights."""
     # The backward of `split` concatenates three pieces; that of indexing would add three whole images.
     channels, distance, weight = sums.split((len(sums) - 2, 1, 1))
@@ -336,4 +248,4 @@ def _normalise_sums(
     color = channels.clone() if background is None else channels + (1 - alpha) * background[:, None, None]
     seen = weight > 0
     depth = torch.where(seen, distance / torch.where(seen, weight, torch.ones_like(weight)), 0)
-    return Rendering(color, alpha, depth, info, background)
+    return Rendering(color, alpha, depth, background)

@@ -22,13 +22,12 @@ from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.projection import (
     Footprints,
     ProjectedGaussians,
-    Selection,
     compute_footprints,
     is_in_image,
     project_gaussians,
     select_drawable,
 )
-from pansplat.rendering.rasterize import Kernel, RasterInfo, RasterOptions, RasterSums
+from pansplat.rendering.rasterize import Kernel, RasterOptions
 from pansplat.system.threads import one_thread
 
 TILE_SIZE = 8  # pixels
@@ -74,32 +73,27 @@ def rasterize_planes(
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
-) -> RasterSums:
+) -> Float[Tensor, "plane sums height width"]:
     """Rasterise with torch operations; see `pansplat.rendering.rasterize.RasterBackend`."""
     if planes[0].eye_offset:
         return _rasterize_columns(gaussians, pose, planes[0], options)
-    chosen, projected = _select_and_project(gaussians, pose, planes[0], options)
-    sums, visible, intersections = zip(*(_rasterize_plane(projected, plane, options) for plane in planes), strict=True)
-    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, sum(visible), sum(intersections))
-    return RasterSums(torch.stack(sums), info)
+    projected = _project(gaussians, pose, planes[0], options)
+    return torch.stack([_rasterize_plane(projected, plane, options) for plane in planes])
 
 
-def _select_and_project(
+def _project(
     gaussians: Gaussians,
     pose: Float[Tensor, "4 4"],
     plane: ImagePlane,
     options: RasterOptions,
-) -> tuple[Selection, ProjectedGaussians]:
-    """The drawable Gaussians, and their projection from a camera."""
-    chosen = select_drawable(gaussians, pose.detach(), options)
-    projected = project_gaussians(
-        chosen.gaussians,
+) -> ProjectedGaussians:
+    """The drawable Gaussians, projected from a camera."""
+    return project_gaussians(
+        select_drawable(gaussians, pose, options.near),
         pose,
         filter_variance=options.filter_variance(plane.pixel_angle),
-        compensate=options.compensate,
         exact=options.kernel == "ray",
     )
-    return chosen, projected
 
 
 def _rasterize_columns(
@@ -107,14 +101,13 @@ def _rasterize_columns(
     pose: Float[Tensor, "4 4"],
     plane: ImagePlane,
     options: RasterOptions,
-) -> RasterSums:
+) -> Float[Tensor, "1 sums height width"]:
     """Rasterise each column of a panorama from its own eye: section 9, literally; kernel "ray" only."""
     (height, width), directions = plane.size, plane.directions()
-    columns, visible, intersections = [], 0, 0
-    counted, _ = _select_and_project(gaussians, pose, plane, options)
+    columns = []
     for column, eye in enumerate(plane.column_eyes()):
         moved = torch.cat((pose[:, :3], (pose[:, 3] + pose[:, :3] @ eye)[:, None]), dim=1)
-        _, projected = _select_and_project(gaussians, moved, plane, options)
+        projected = _project(gaussians, moved, plane, options)
         footprints, boxes = compute_footprints(projected, plane, options)
         # A box may wrap around: count the columns from its left edge on.
         after_left = torch.remainder(column + 0.5 - boxes[:, 0], width)
@@ -125,26 +118,24 @@ def _rasterize_columns(
         boxes[:, 0], boxes[:, 1] = 0, 1  # of an image of this column alone
         order = torch.argsort(projected.radius.detach()[reached], stable=True)
         pixels = _arrange_points(directions[:, column : column + 1], projected.peak.dtype)
-        bands = []
-        for band in intersect_tiles(boxes, order, (height, 1), wraps=False):
-            bands.append(composite(footprints, band, pixels, exact=True))
-            intersections += len(band.indices)
+        bands = [
+            composite(footprints, band, pixels, exact=True)
+            for band in intersect_tiles(boxes, order, (height, 1), wraps=False)
+        ]
         sums = torch.cat(bands).reshape(-1, TILE_SIZE, TILE_SIZE, bands[0].shape[-1])[:, :, 0].flatten(0, 1)
         columns.append(sums[:height].T)
-        visible += len(reached)
-    info = RasterInfo(counted.total, counted.dropped, counted.near, visible, intersections)
-    return RasterSums(torch.stack(columns, dim=2)[None], info)
+    return torch.stack(columns, dim=2)[None]
 
 
 def _rasterize_plane(
     projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions
-) -> tuple[Float[Tensor, "sums height width"], int, int]:
-    """Compute sums of weight x (channels, distance, 1), and count visible Gaussians and intersections."""
+) -> Float[Tensor, "sums height width"]:
+    """Compute sums of weight x (channels, distance, 1)."""
     z = (projected.direction.detach() @ plane.rotation[:, 2]) * projected.radius.detach()
     if options.kernel == "ewa":
         ahead = z > EWA_NEAR_FACTOR * options.near
         projected, z = ProjectedGaussians(*(field[ahead] for field in projected)), z[ahead]
-    key = projected.radius.detach() if options.order == "radial" or plane.is_panorama else z
+    key = projected.radius.detach() if options.kernel == "ray" else z
     footprints, boxes = compute_footprints(projected, plane, options)
     visible = torch.nonzero(is_in_image(boxes, plane))[:, 0]
     if len(visible) < len(boxes):
@@ -153,13 +144,13 @@ def _rasterize_plane(
     pixels = _arrange_pixels(plane, options.kernel, projected.peak.dtype)
     rows, columns = tile_grid(*plane.size)
     order = torch.argsort(key, stable=True)
-    bands, intersections = [], 0
-    for band in intersect_tiles(boxes, order, plane.size, wraps=plane.is_panorama):
-        bands.append(composite(footprints, band, pixels, exact=options.kernel == "ray"))
-        intersections += len(band.indices)
+    bands = [
+        composite(footprints, band, pixels, exact=options.kernel == "ray")
+        for band in intersect_tiles(boxes, order, plane.size, wraps=plane.is_panorama)
+    ]
     sums = torch.cat(bands).reshape(rows, columns, TILE_SIZE, TILE_SIZE, -1)
     sums = sums.permute(4, 0, 2, 1, 3).reshape(-1, rows * TILE_SIZE, columns * TILE_SIZE)
-    return sums[:, : plane.size[0], : plane.size[1]], len(visible), intersections
+    return sums[:, : plane.size[0], : plane.size[1]]
 
 
 def _arrange_pixels(plane: ImagePlane, kernel: Kernel, dtype: torch.dtype) -> TilePixels:

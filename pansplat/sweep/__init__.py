@@ -6,6 +6,6 @@ matches), `surface` (consistency between views, upsampling), `lift` (Gaussians).
 the prior; `joined_crops` joins the depth of a user's network.
 """
 
-from pansplat.sweep.predictor import Sweep, SweepConfig
+from pansplat.sweep.predictor import Sweep
 
-__all__ = ["Sweep", "SweepConfig"]
+__all__ = ["Sweep"]

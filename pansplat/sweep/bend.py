@@ -13,7 +13,6 @@ rows and meridians as closed lines, so that it has neither seam nor pole.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -29,29 +28,19 @@ _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the fi
 _MAX_ROW_COUPLING = 1e3  # of neighbouring pixels in a row, which are close to each other at the poles
 
 
-@dataclass(frozen=True)
-class BendConfig:
-    """Settings of the evidence and of the fields, from the smoothest to the finest."""
+# Evidence
+_TOLERANCE = 0.03  # relative difference of depth of two views' surfaces that agree; evidence ends at twice of it
+_MAX_DIFFERENCE = 0.12  # mean difference of colour of 5x5 pixels above which a match is no evidence
+_FULL_PARALLAX = 0.25  # angle between the two rays to a point from which a match has full weight, radians
 
-    tolerance: float = 0.03
-    """Relative difference of depth of two views' surfaces up to which they agree; evidence ends at twice of it."""
-    max_difference: float = 0.12
-    """Mean difference of colour of 5x5 pixels above which a match is no evidence."""
-    full_parallax: float = 0.25
-    """Angle between the two rays to a point from which a match has full weight, radians."""
-    smoothness: tuple[float, ...] = (1e5, 3e3, 300.0, 30.0, 3.0)
-    """Coupling of neighbouring pixels, relative to full evidence."""
-    stiffness: tuple[float, ...] = (0.0, 0.01, 0.02, 0.04, 0.05)
-    """Evidence at which a field has half of its amplitude."""
-    discontinuity: float = 0.06
-    """Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence
-    for the field, above `slope`."""
-    slope: float = 0.02
-    """Difference of the field between pixels that is no discontinuity."""
-    outlier: tuple[float, ...] = (1.0, 0.6, 0.3, 0.15, 0.06)
-    """Deviation from a field, in log-depth, that halves the weight of a match."""
-    iterations: int = 2
-    """Weightings of the matches by their deviation, for each field."""
+# Fields, from the smoothest to the finest
+_SMOOTHNESS = (1e5, 3e3, 300.0, 30.0, 3.0)  # coupling of neighbouring pixels, relative to full evidence
+_STIFFNESS = (0.0, 0.01, 0.02, 0.04, 0.05)  # evidence at which a field has half of its amplitude
+_OUTLIER = (1.0, 0.6, 0.3, 0.15, 0.06)  # deviation from a field, in log-depth, that halves the weight of a match
+_ITERATIONS = 2  # weightings of the matches by their deviation, for each field
+# Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence for
+# the field, above a difference that is no discontinuity.
+_DISCONTINUITY, _SLOPE = 0.06, 0.02
 
 
 def bend_surfaces(
@@ -59,7 +48,6 @@ def bend_surfaces(
     surfaces: Sequence[Surface],
     neighbours: Sequence[Sequence[int]],
     log_depths: Sequence[Float[np.ndarray, "h w"]],
-    config: BendConfig,
 ) -> list[Surface]:
     """The surfaces of single views, bent towards those that a search found.
 
@@ -71,14 +59,14 @@ def bend_surfaces(
     """
     bent = []
     for view, (surface, log_depth) in enumerate(zip(surfaces, log_depths, strict=True)):
-        evidence = measure_evidence(posed, surfaces, view, neighbours[view], config)
-        field = fit_field(-np.log(surface.inverse_depth) - log_depth, evidence, log_depth, config)
+        evidence = measure_evidence(posed, surfaces, view, neighbours[view])
+        field = fit_field(-np.log(surface.inverse_depth) - log_depth, evidence, log_depth)
         bent.append(Surface(np.exp(-log_depth - field).astype(np.float32)))
     return bent
 
 
 def measure_evidence(
-    posed: PosedImages, surfaces: Sequence[Surface], view: int, others: Sequence[int], config: BendConfig
+    posed: PosedImages, surfaces: Sequence[Surface], view: int, others: Sequence[int]
 ) -> Float[np.ndarray, "h w"]:
     """Weight in [0, 1] of each match of a view: surfaces and colours agree, and the rays have parallax.
 
@@ -95,15 +83,15 @@ def measure_evidence(
         distance = np.linalg.norm(local, axis=-1)
         pixel = nearest_pixel(local, surface.height)
         deviation = np.abs(np.log(np.maximum(distance * surfaces[other].inverse_depth[pixel], 1e-6)))
-        weight = np.clip(2 - deviation / config.tolerance, 0, 1) * posed.masks[other][pixel]
+        weight = np.clip(2 - deviation / _TOLERANCE, 0, 1) * posed.masks[other][pixel]
         difference = np.abs(posed.images[other][pixel] - image).mean(axis=2)
         mean = cv2.boxFilter(pad_sphere(difference, 2), -1, (5, 5))[2:-2, 2:-2]
-        weight *= mean < config.max_difference
+        weight *= mean < _MAX_DIFFERENCE
         rays = points - pose[:3, 3]
         cosine = np.einsum("hwc,hwc->hw", rays, points - there[:3, 3])
         cosine /= np.maximum(np.linalg.norm(rays, axis=-1) * distance, 1e-9)
         parallax = np.arccos(np.clip(cosine, -1, 1))
-        np.maximum(evidence, weight * np.minimum(parallax / config.full_parallax, 1), out=evidence)
+        np.maximum(evidence, weight * np.minimum(parallax / _FULL_PARALLAX, 1), out=evidence)
     return evidence * posed.masks[view]
 
 
@@ -111,7 +99,6 @@ def fit_field(
     target: Float[np.ndarray, "h w"],
     evidence: Float[np.ndarray, "h w"],
     log_depth: Float[np.ndarray, "h w"],
-    config: BendConfig,
 ) -> Float[np.ndarray, "h w"]:
     """The logarithm of the field by which a view's depth is multiplied.
 
@@ -125,9 +112,9 @@ def fit_field(
     weight = evidence * area
     is_known = weight.sum() > _MIN_EVIDENCE * area.sum() * target.shape[1]
     field = np.full(target.shape, _weighted_median(target, weight if is_known else area + 0 * target))
-    rows, meridians = _couple(target, evidence, log_depth, area, config)
-    for smoothness, stiffness, outlier in zip(config.smoothness, config.stiffness, config.outlier, strict=True):
-        for _ in range(config.iterations):
+    rows, meridians = _couple(target, evidence, log_depth, area)
+    for smoothness, stiffness, outlier in zip(_SMOOTHNESS, _STIFFNESS, _OUTLIER, strict=True):
+        for _ in range(_ITERATIONS):
             rest = target - field
             weighted = weight / (1 + (rest / outlier) ** 2)
             sums = _smooth(np.stack((weighted * rest, weighted)), rows, meridians, smoothness)
@@ -142,7 +129,7 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _couple(
-    target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray, area: np.ndarray, config: BendConfig
+    target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray, area: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Couplings of each pixel with the next one of its row, and of its meridian as `_as_meridians` has them."""
     dense = cv2.boxFilter(pad_sphere(evidence.astype(np.float32), 2), -1, (5, 5))[2:-2, 2:-2]
@@ -152,8 +139,8 @@ def _couple(
     for lines in (maps, _as_meridians(maps)):
         following = np.roll(lines, -1, axis=-1)
         jumps, field_jumps, _ = np.abs(following - lines)
-        field_jumps = np.maximum(field_jumps - config.slope, 0) * np.minimum(lines[2], following[2])
-        couplings.append(np.exp(-(jumps + field_jumps) / config.discontinuity))
+        field_jumps = np.maximum(field_jumps - _SLOPE, 0) * np.minimum(lines[2], following[2])
+        couplings.append(np.exp(-(jumps + field_jumps) / _DISCONTINUITY))
     return couplings[0] * np.minimum(1 / np.maximum(area, 1e-6) ** 2, _MAX_ROW_COUPLING), couplings[1]
 
 

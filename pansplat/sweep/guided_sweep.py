@@ -32,7 +32,6 @@ from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
 from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
 from pansplat.sweep import Sweep
 from pansplat.sweep.joined_crops import crop_panorama, join_crops
-from pansplat.sweep.predictor import SweepConfig
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.search import SearchConfig
 from pansplat.sweep.surface import resize_sphere
@@ -61,8 +60,7 @@ def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | s
     fingerprint = digest.hexdigest() + hash_sources(__name__) + ("" if relative is None else relative.fingerprint)
     prior = NetworkPrior(*networks, fingerprint, relative=relative)
     # A user's network has better shapes than ours, whose scale errs so that the whole range of depth is searched.
-    search = SearchConfig(finest_height=_SEARCH_HEIGHT, near_single_views=relative is not None)
-    return Sweep(SweepConfig(search=search), prior, name)
+    return Sweep(SearchConfig(_SEARCH_HEIGHT, near_single_views=relative is not None), prior, name)
 
 
 @lru_cache(maxsize=1)

@@ -53,52 +53,36 @@ _MAX_LENGTH = 0.2  # largest standard deviation of a disc, relative to its dista
 _MIN_DISTANCE = 0.5  # smallest distance of a Gaussian from an input camera, relative to `near`
 
 
-@dataclass(frozen=True)
-class LiftConfig:
-    """Settings of the Gaussians' sizes, opacities and levels."""
+# Sizes of the Gaussians
+_FOOTPRINT = 0.7  # standard deviation of a disc, in lattice spacings
+_FINE_FOOTPRINT = 0.6  # the same on lattices finer than the surface
+_THICKNESS = 0.1  # standard deviation across the surface, relative to the disc's
+_MAX_STRETCH = (4.0, 4.0, 12.0, 24.0)  # largest ratio of a disc's long axis to its short one, by level
+_BACKGROUND_DEPTH = (1.02, 1.04)  # depth of levels 2 and 3 relative to the background
+_BACKGROUND_REACH = (4, 8)  # by which the background is extended in front of a discontinuity, pixels of the level
 
-    surface_height: int = 512
-    """Panoramas of twice this height or more have surfaces of a half, a quarter ... of their height, not below this."""
-    footprint: float = 0.7
-    """Standard deviation of a disc, in lattice spacings."""
-    fine_footprint: float = 0.6
-    """The same on lattices finer than the surface."""
-    thickness: float = 0.1
-    """Standard deviation across the surface, relative to the disc's."""
-    max_stretch: tuple[float, float, float, float] = (4.0, 4.0, 12.0, 24.0)
-    """Largest ratio of a disc's long axis to its short one, by level."""
-    background_depth: tuple[float, float] = (1.02, 1.04)
-    """Depth of levels 2 and 3 relative to the background."""
-    background_reach: tuple[int, int] = (4, 8)
-    """Distance over which the background is extended in front of a discontinuity, pixels of the level."""
-    detail: float = 0.02
-    """Largest colour error of level 1."""
-    fine_detail: float = 0.015
-    """Largest colour error of a lattice where no finer one replaces it."""
-    fine_points: int = 780_000
-    """Largest number of a view's points on the finer lattices; a larger error is allowed where they do not suffice."""
-    discontinuity: float = 0.15
-    """Relative change of inverse depth between pixels at a discontinuity."""
-    tolerance: float = 0.15
-    """Relative difference of depth up to which another view confirms a point, and beyond which it may remove it: more
-    than in `consistency_mask`, which chooses the pixels that may remove points."""
-    consistent_opacity: float = 0.95
-    """Where another view is consistent."""
-    single_view_opacity: float = 0.9
-    """Where no other view sees the surface."""
-    uncertain_opacity: float = 0.8
-    """In the free space of another view whose own surface is not consistent with any view."""
+# Levels
+_SURFACE_HEIGHT = 512  # of panoramas of twice this height or more: surfaces of a half, a quarter ..., not below this
+_DETAIL = 0.02  # largest colour error of level 1
+_FINE_DETAIL = 0.015  # largest colour error of a lattice where no finer one replaces it
+_FINE_POINTS = 780_000  # of a view on the finer lattices, at most: a larger error is allowed where they do not suffice
+_DISCONTINUITY = 0.15  # relative change of inverse depth between pixels at a discontinuity
+
+# Relative difference of depth up to which another view confirms a point, and beyond which it may remove it: more than
+# in `consistency_mask`, which chooses the pixels that may remove points.
+_TOLERANCE = 0.15
+_CONSISTENT_OPACITY = 0.95  # where another view is consistent
+_SINGLE_VIEW_OPACITY = 0.9  # where no other view sees the surface
+_UNCERTAIN_OPACITY = 0.8  # in the free space of another view whose own surface is not consistent with any view
 
 
-def lift(
-    posed: PosedImages, surfaces: list[Surface], config: LiftConfig, neighbours: Sequence[Sequence[int]]
-) -> Gaussians:
+def lift(posed: PosedImages, surfaces: list[Surface], neighbours: Sequence[Sequence[int]]) -> Gaussians:
     """The Gaussians of all views and levels, ordered by level, then view, then lattice (finest first) and point.
 
     Args:
         neighbours: the other views whose surfaces confirm or contradict those of each view.
     """
-    photographs, heights = posed.images, _lattice_heights(posed.images.shape[1], config.surface_height)
+    photographs, heights = posed.images, _lattice_heights(posed.images.shape[1], _SURFACE_HEIGHT)
     posed = posed.resize(heights[-1])
     if surfaces[0].height != heights[-1]:
         surfaces = [
@@ -107,9 +91,9 @@ def lift(
         ]
     views = range(len(surfaces))
     consistent = [consistency_mask(surfaces, posed.cam2world, view, neighbours[view]) for view in views]
-    scene = _PosedSurfaces(posed, surfaces, neighbours, consistent, config)
+    scene = _PosedSurfaces(posed, surfaces, neighbours, consistent)
     scene = replace(scene, surfaces=[_remove_inconsistent(scene, view) for view in views])
-    fine = [_choose_fine_pixels(image, heights, config) for image in photographs]
+    fine = [_choose_fine_pixels(image, heights) for image in photographs]
     parts = []
     for level in range(NUM_LEVELS):
         lattice = _locate_lattice(heights[-1] >> level, heights[-1])
@@ -123,10 +107,10 @@ def lift(
     return Gaussians.cat(parts)
 
 
-def _background_inverse_depth(inverse: np.ndarray, mask: np.ndarray, level: int, config: LiftConfig) -> np.ndarray:
+def _background_inverse_depth(inverse: np.ndarray, mask: np.ndarray, level: int) -> np.ndarray:
     """Inverse depth at a coarse level's size, with the far side extended over every discontinuity."""
     height = inverse.shape[0] >> level
-    reach = min(config.background_reach[level - 2], height // 4)
+    reach = min(_BACKGROUND_REACH[level - 2], height // 4)
     valid = np.where(mask, inverse, np.float32(inverse.max()))
     far = valid.reshape(height, 1 << level, 2 * height, 1 << level).min(axis=(1, 3))
     far = pad_sphere(_window_extremum(far, reach, largest=False), 2 * reach)
@@ -141,15 +125,14 @@ class _PosedSurfaces:
     surfaces: list[Surface]
     neighbours: Sequence[Sequence[int]]
     consistent: list[np.ndarray]
-    config: LiftConfig
 
 
 def _remove_inconsistent(scene: _PosedSurfaces, view: int) -> Surface:
     """The surface, with the points in other views' consistent free space moved back to the background layer."""
-    surface, config = scene.surfaces[view], scene.config
+    surface = scene.surfaces[view]
     points = world_points(surface, scene.posed.cam2world[view]).reshape(-1, 3)
     _, kept = _estimate_opacity(points, scene, view)
-    far = _background_inverse_depth(surface.inverse_depth, scene.posed.masks[view], 2, config)
+    far = _background_inverse_depth(surface.inverse_depth, scene.posed.masks[view], 2)
     behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
     return Surface(np.where(kept.reshape(behind.shape), surface.inverse_depth, behind))
 
@@ -161,7 +144,7 @@ def _lattice_heights(height: int, surface_height: int) -> list[int]:
     return [base << n for n in range(finer, -1, -1)]
 
 
-def _choose_fine_pixels(image: np.ndarray, heights: list[int], config: LiftConfig) -> list[np.ndarray]:
+def _choose_fine_pixels(image: np.ndarray, heights: list[int]) -> list[np.ndarray]:
     """Masks (h, 2h) of the pixels that each lattice finer than the surface holds, and of those that any of them holds.
 
     A lattice is replaced by a finer one where it would lose detail of the panorama.
@@ -170,7 +153,7 @@ def _choose_fine_pixels(image: np.ndarray, heights: list[int], config: LiftConfi
     for height, coarser in itertools.pairwise(heights):
         detail = resize_sphere(image, height)
         errors.append(np.abs(detail - resize_sphere(resize_sphere(detail, coarser), height)).max(axis=2))
-    limit = config.fine_detail
+    limit = _FINE_DETAIL
     while True:
         masks, count = [], 0.0
         finer = np.zeros((heights[0], 2 * heights[0]), bool)
@@ -179,9 +162,9 @@ def _choose_fine_pixels(image: np.ndarray, heights: list[int], config: LiftConfi
             masks.append(np.repeat(np.repeat(split, 2, axis=0), 2, axis=1) & ~finer)
             count += lattice_size(2 * height) * _area_fraction(masks[-1])
             finer = split
-        if count <= config.fine_points:
+        if count <= _FINE_POINTS:
             return [*masks, finer]
-        limit *= max(1.05, (count / config.fine_points) ** 0.5)
+        limit *= max(1.05, (count / _FINE_POINTS) ** 0.5)
 
 
 def _any_in_blocks(mask: np.ndarray) -> np.ndarray:
@@ -208,9 +191,9 @@ def _lift_level(scene: _PosedSurfaces, view: int, level: int, lattice: _Lattice,
     if level >= 2:
         # No other view shows what a single one masks, and its depth is the prior's: the background continues there.
         covered = mask if len(scene.surfaces) > 1 else np.ones_like(mask)
-        color, inverse = _background_layer(image, inverse, mask, covered, level, scene.config)
+        color, inverse = _background_layer(image, inverse, mask, covered, level)
         return _lift_lattice(scene, view, level, lattice, color, inverse, covered)
-    needed = mask & ~replaced & (_choose_levels(image, inverse, scene.config) == level)
+    needed = mask & ~replaced & (_choose_levels(image, inverse) == level)
     height = len(image) >> level
     resized = resize_sphere(image, height), resize_sphere(inverse, height)
     return _lift_lattice(scene, view, level, lattice, *resized, needed)
@@ -226,7 +209,7 @@ def _lift_lattice(
     needed: np.ndarray,
 ) -> Gaussians:
     """The points of a lattice with the spacing of the image's pixels, where they are needed."""
-    config, pose = scene.config, np.ascontiguousarray(scene.posed.cam2world[view], np.float64)
+    pose = np.ascontiguousarray(scene.posed.cam2world[view], np.float64)
     rays, pixel = lattice
     spacing = math.sqrt(4 * math.pi / len(rays))
     rays = rays[needed[pixel]]
@@ -235,13 +218,13 @@ def _lift_lattice(
     opacity, kept = _estimate_opacity(points, scene, view)
     rays, inverse_depth, points, opacity = rays[kept], inverse_depth[kept], points[kept], opacity[kept]
     sloped = inverse if level else scene.surfaces[view].inverse_depth
-    gradient = _differentiate_log(sloped, config.discontinuity if level < 2 else math.inf)
+    gradient = _differentiate_log(sloped, _DISCONTINUITY if level < 2 else math.inf)
     is_fine = len(image) > scene.surfaces[view].height
-    size = spacing * (config.fine_footprint if is_fine else config.footprint)
+    size = spacing * (_FINE_FOOTPRINT if is_fine else _FOOTPRINT)
     # A disc that is nearly parallel to its ray must end well before the camera.
-    steepest = min(config.max_stretch[level], _MAX_LENGTH / size)
+    steepest = min(_MAX_STRETCH[level], _MAX_LENGTH / size)
     quats, scales = np.empty((len(rays), 4), np.float32), np.empty((len(rays), 3), np.float32)
-    shape = rays, inverse_depth, gradient, size, steepest, config.thickness, pose, quats, scales
+    shape = rays, inverse_depth, gradient, size, steepest, _THICKNESS, pose, quats, scales
     for_point_ranges(partial(_shape_discs, *shape), len(rays))
     color = np.empty((len(rays), 3), np.float32)
     for_point_ranges(partial(_sample_bilinear, pad_sphere(image, 1), rays, color), len(rays))
@@ -284,18 +267,18 @@ def _window_extremum(values: np.ndarray, radius: int, *, largest: bool) -> np.nd
     return grown[radius:-radius, radius:-radius]
 
 
-def _choose_levels(image: np.ndarray, inverse: np.ndarray, config: LiftConfig) -> np.ndarray:
+def _choose_levels(image: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Level (h, w), 0 or 1: the coarser where it keeps the image's detail and the surface's discontinuities."""
     height = image.shape[0]
     coarse = resize_sphere(resize_sphere(image, height // 2), height)
     error = np.abs(image - coarse).max(axis=2)
     near, far = _window_extremum(inverse, 1, largest=True), _window_extremum(inverse, 1, largest=False)
-    fine = (error > config.detail) | (near > far * (1 + config.discontinuity))
+    fine = (error > _DETAIL) | (near > far * (1 + _DISCONTINUITY))
     return np.where(_window_extremum(fine.astype(np.uint8), 2, largest=True) > 0, 0, 1)
 
 
 def _background_layer(
-    image: np.ndarray, inverse: np.ndarray, mask: np.ndarray, covered: np.ndarray, level: int, config: LiftConfig
+    image: np.ndarray, inverse: np.ndarray, mask: np.ndarray, covered: np.ndarray, level: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Image and inverse depth of the background at level 2 or 3.
 
@@ -303,9 +286,9 @@ def _background_layer(
         mask, covered: where the image shows the scene, and where the depth is that of the scene.
     """
     height = image.shape[0] >> level
-    far = _background_inverse_depth(inverse, covered, level, config)
+    far = _background_inverse_depth(inverse, covered, level)
     # Colours of the pixels at or behind the layer, extrapolated over the gaps between them.
-    behind = mask & (inverse <= (1 + config.discontinuity) * resize_sphere(far, image.shape[0]))
+    behind = mask & (inverse <= (1 + _DISCONTINUITY) * resize_sphere(far, image.shape[0]))
     weight = resize_sphere(behind.astype(np.float32), height)
     color = resize_sphere(image * behind[..., None], height)
     filled_color, filled_weight = color.copy(), weight.copy()
@@ -320,7 +303,7 @@ def _background_layer(
     unknown = filled_weight < 1e-3
     color_map = filled_color / np.maximum(filled_weight, 1e-3)[..., None]
     color_map[unknown] = resize_sphere(image, height)[unknown]
-    return color_map.astype(np.float32), (far / config.background_depth[level - 2]).astype(np.float32)
+    return color_map.astype(np.float32), (far / _BACKGROUND_DEPTH[level - 2]).astype(np.float32)
 
 
 def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -328,18 +311,18 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
 
     A point in the consistent free space of more views than confirm it is not kept.
     """
-    config, posed = scene.config, scene.posed
+    posed = scene.posed
     # Rows of `counts`: views that confirm the point, that contradict it, that may, and that are too near to it.
     counts = np.zeros((4, len(points)), np.int16)
     for other in scene.neighbours[view]:
         certain = scene.consistent[other] & posed.masks[other]
         pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
         inverse = scene.surfaces[other].inverse_depth
-        limits = config.tolerance, _MIN_DISTANCE * posed.near
+        limits = _TOLERANCE, _MIN_DISTANCE * posed.near
         for_point_ranges(partial(_count_judgements, points, inverse, certain, pose, *limits, counts), len(points))
     confirmed, contradicted, doubtful, near = counts
-    opacity = np.where(doubtful > 0, np.float32(config.uncertain_opacity), np.float32(config.single_view_opacity))
-    opacity[confirmed > 0] = config.consistent_opacity
+    opacity = np.where(doubtful > 0, np.float32(_UNCERTAIN_OPACITY), np.float32(_SINGLE_VIEW_OPACITY))
+    opacity[confirmed > 0] = _CONSISTENT_OPACITY
     return opacity, (near == 0) & (contradicted <= confirmed)
 
 

@@ -19,7 +19,7 @@ import math
 from collections import namedtuple
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import NamedTuple
 
@@ -467,24 +467,19 @@ def compute_matching_cost(
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
-@dataclass(frozen=True)
-class AggregationConfig:
-    """Penalties for a change of hypothesis between neighbouring pixels, in the unit of the matching cost."""
-
-    step_penalty: float = 0.08
-    crease_penalty: float = 0.15
-    jump_penalty: float = 1.6
-    edge_scale: float = 0.1
-    """Sum of absolute colour differences that divides the jump penalty by e."""
-
-
 class _Penalties(NamedTuple):
-    """The values of an `AggregationConfig`."""
+    """Penalties for a change of hypothesis between neighbouring pixels, in the unit of the matching cost.
+
+    `edge_scale` is the sum of absolute colour differences that divides the jump penalty by e.
+    """
 
     step: np.float32
     crease: np.float32
     jump: np.float32
     edge_scale: np.float32
+
+
+_PENALTIES = _Penalties(*np.float32((0.08, 0.15, 1.6, 0.1)))
 
 
 @nb.njit(fastmath=True, inline="always")
@@ -594,9 +589,7 @@ def _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, r
         previous, current = current, previous
 
 
-def aggregate_costs(
-    cost: np.ndarray, guide: np.ndarray, slot_map: np.ndarray, slots: int, config: AggregationConfig
-) -> np.ndarray:
+def aggregate_costs(cost: np.ndarray, guide: np.ndarray, slot_map: np.ndarray, slots: int) -> np.ndarray:
     """Sum of the path costs of all eight directions, (h, w, sets * count).
 
     Args:
@@ -608,15 +601,14 @@ def aggregate_costs(
     """
     height = len(cost)
     stretch = np.minimum(1 / row_weights(height).numpy(), 8).astype(np.float32)
-    penalties = _Penalties(*np.float32(astuple(config)))
 
     def run(directions: tuple[tuple[int, int], ...]) -> np.ndarray:
         total = np.zeros_like(cost)
         for dy, dx in directions:
             if dy == 0:
-                _aggregate_rows(cost, total, guide, slot_map, slots, penalties, stretch, dx, height)  # half a turn
+                _aggregate_rows(cost, total, guide, slot_map, slots, _PENALTIES, stretch, dx, height)  # half a turn
             else:
-                _aggregate_columns(cost, total, guide, slot_map, slots, penalties, dy, dx, height // 4)
+                _aggregate_columns(cost, total, guide, slot_map, slots, _PENALTIES, dy, dx, height // 4)
         return total
 
     groups = (_DIRECTIONS[::2], _DIRECTIONS[1::2])  # of equal cost, a thread each

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -17,8 +16,8 @@ from pansplat.geometry.world import require_working_world
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.pairs import MAX_CONTEXT
 from pansplat.predictor import require_matching_inputs, select_item
-from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
-from pansplat.sweep.lift import LiftConfig, lift
+from pansplat.rendering.color_fit import fit_colors
+from pansplat.sweep.lift import lift
 from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages
@@ -26,15 +25,6 @@ from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 
 _MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
-
-
-@dataclass(frozen=True)
-class SweepConfig:
-    """Settings of the sweep."""
-
-    search: SearchConfig = field(default_factory=SearchConfig)
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    colors: ColorFitConfig = field(default_factory=ColorFitConfig)
 
 
 class Sweep:
@@ -49,8 +39,10 @@ class Sweep:
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
 
-    def __init__(self, config: SweepConfig | None = None, prior: PriorModel | None = None, name: str = "sweep") -> None:
-        self.config, self.prior, self.name = config or SweepConfig(), prior, name
+    def __init__(
+        self, config: SearchConfig | None = None, prior: PriorModel | None = None, name: str = "sweep"
+    ) -> None:
+        self.config, self.prior, self.name = config or SearchConfig(), prior, name
         digest = hashlib.blake2b(f"{self.config} {hash_sources(__name__)}".encode(), digest_size=8)
         self.fingerprint = f"sweep-{digest.hexdigest()}" + ("" if prior is None else f"-{prior.fingerprint}")
         """Hash of the settings and of the source code that computes the Gaussians; keys the prediction cache."""
@@ -106,19 +98,18 @@ class Sweep:
             near=low,
             far=high,
         )
-        config = self.config
         with stage(0.57):  # of the time, as are all fractions here (the sample on two cores)
             # Axes of the scene, planes, and of each view its neighbours and the depth that the prior model expects.
-            scene = observe(posed, config.search, self.prior)
+            scene = observe(posed, self.config, self.prior)
             # Inverse depth (h, 2h) of each view, at most `SearchConfig.finest_height` high.
             surfaces = search(scene)
         report_progress("placing Gaussians", 0.57)
         # A Gaussian for each point of the lattices (n); the photograph's height gives their spacing.
-        gaussians = lift(posed, surfaces, config.lift, scene.neighbours)
+        gaussians = lift(posed, surfaces, scene.neighbours)
         report_progress("fitting colours", 0.76)
         # Colours (n, 1, 3) with which the Gaussians of each view draw its photograph.
         poses = torch.from_numpy(posed.cam2world)
-        gaussians = fit_colors(gaussians, images.detach().cpu(), poses, fitted, config.colors)
+        gaussians = fit_colors(gaussians, images.detach().cpu(), poses, fitted)
         report_progress("done", 1.0)
         return gaussians.to(device=images.device)
 

@@ -41,22 +41,13 @@ _FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that 
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
 _MIN_SPREAD = 0.1  # relative deviation of an estimate, at least, when it decides what a view sees
 _MIN_OVERLAP = 0.5  # of views that are matched
+_ITERATIONS = 2  # refinements by comparison of the views
 
-
-@dataclass(frozen=True)
-class PriorConfig:
-    """Weights of the prior, in the unit of the matching cost."""
-
-    weight: float = 0.25
-    """Cost of a deviation by one Laplace scale."""
-    cap: float = 3.0
-    """Deviation, in Laplace scales, above which the cost is constant."""
-    min_scale: float = 0.03
-    """Smallest Laplace scale of log-depth."""
-    further_penalty: float = 0.25
-    """Added to the deviation from each prior but the first, in Laplace scales."""
-    iterations: int = 2
-    """Refinements by comparison of the views."""
+# The cost of a prior, in the unit of the matching cost
+_WEIGHT = 0.25  # cost of a deviation by one Laplace scale
+_CAP = 3.0  # deviation, in Laplace scales, above which the cost is constant
+_MIN_SCALE = 0.03  # smallest Laplace scale of log-depth
+_FURTHER_PENALTY = 0.25  # added to the deviation from each prior but the first, in Laplace scales
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +124,8 @@ class PriorEstimator:
         cam2world: np.ndarray,
         down: np.ndarray,
         limits: tuple[float, float],
-        config: PriorConfig,
     ) -> None:
-        self._cam2world, self._down, self._limits, self._config = cam2world, down, limits, config
+        self._cam2world, self._down, self._limits = cam2world, down, limits
         self._usual_height = min(max(CAMERA_HEIGHT, 1 / limits[1]), 1 / limits[0])
         self._turns = [upright_rotation(pose[:3, :3], down) for pose in cam2world]
         self._observed = model.observe(
@@ -184,7 +174,6 @@ class PriorEstimator:
         self,
         views: Sequence[View],
         neighbours: Sequence[Sequence[int]],
-        matching: MatchingConfig,
     ) -> list[list[DepthPrior]]:
         """The priors of each view, from the height by the floor and, where it differs, from that by all surfaces.
 
@@ -199,7 +188,7 @@ class PriorEstimator:
             pair = [[maps[n] for n in nodes] for maps in (first, views)]
             by_pair[nodes] = [
                 _estimate_camera_heights(
-                    *pair, self._cam2world[list(nodes)], self._down, self._limits, matching, floor_only=floor_only
+                    *pair, self._cam2world[list(nodes)], self._down, self._limits, floor_only=floor_only
                 )
                 for floor_only in (True, False)
             ]
@@ -207,8 +196,8 @@ class PriorEstimator:
         if np.abs(np.log(np.divide(*heights))).max() < _SAME_HEIGHT:
             heights.pop()
         starts = [_scale_depth(self._observed.priors, own) for own in heights]
-        poses, iterations = self._upright_poses, self._config.iterations
-        refined = [self._turn_back(self._observed.refine(each, poses, neighbours, iterations)) for each in starts]
+        poses = self._upright_poses
+        refined = [self._turn_back(self._observed.refine(each, poses, neighbours, _ITERATIONS)) for each in starts]
         return [list(own) for own in zip(*refined, strict=True)]
 
     def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
@@ -227,7 +216,6 @@ def _estimate_camera_heights(
     cam2world: np.ndarray,
     down: np.ndarray,
     limits: tuple[float, float],
-    config: MatchingConfig,
     *,
     floor_only: bool,
 ) -> list[float]:
@@ -252,7 +240,7 @@ def _estimate_camera_heights(
         for n, prior in enumerate(priors):
             own = 1 / np.maximum(1 / candidates + above[n], 1 / limits[1])  # this camera's, by the mean's
             sampled = np.linspace(own[0], max(own[-1], own[0] + 1e-6), _HEIGHT_CANDIDATES)
-            costs = _match_heights(prior, weights[n], n, views, cam2world, sampled, config)
+            costs = _match_heights(prior, weights[n], n, views, cam2world, sampled)
             total += np.interp(own, sampled, costs)
         best, step = candidates[total.argmin()], candidates[1] - candidates[0]
         low, high = max(best - 2 * step, limits[0]), min(best + 2 * step, limits[1])
@@ -293,7 +281,6 @@ def _match_heights(
     views: Sequence[View],
     cam2world: np.ndarray,
     candidates: np.ndarray,
-    config: MatchingConfig,
 ) -> np.ndarray:
     """Sum of the weighted matching costs (candidates) of a view's prior at each inverse height."""
     inverse = np.exp(-prior.log_depth).astype(np.float32)
@@ -306,20 +293,18 @@ def _match_heights(
     for n, other in enumerate(views):
         if n != index:
             matched = OtherView(other, np.linalg.inv(cam2world[n]) @ cam2world[index], [shape])
-            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), config)
+            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), MatchingConfig())
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 
 
-def apply_prior_cost(
-    cost: np.ndarray, priors: Sequence[DepthPrior], sets: Sequence[HypothesisSet], config: PriorConfig
-) -> None:
+def apply_prior_cost(cost: np.ndarray, priors: Sequence[DepthPrior], sets: Sequence[HypothesisSet]) -> None:
     """Add the lowest cost of the priors to that of all hypotheses (h, w, sets * count), in place."""
     count = len(sets[0].penalty)
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
-    scale = np.stack([np.maximum(prior.scale, config.min_scale) for prior in priors]).astype(np.float32)
-    penalty = np.where(np.arange(len(priors)) > 0, config.further_penalty, 0).astype(np.float32)
-    weight, cap = np.float32(config.weight), np.float32(config.cap)
+    scale = np.stack([np.maximum(prior.scale, _MIN_SCALE) for prior in priors]).astype(np.float32)
+    penalty = np.where(np.arange(len(priors)) > 0, _FURTHER_PENALTY, 0).astype(np.float32)
+    weight, cap = np.float32(_WEIGHT), np.float32(_CAP)
     for n, hypotheses in enumerate(sets):
         base, step = (np.ascontiguousarray(each, np.float32) for each in (hypotheses.base, hypotheses.step))
         add = partial(_add_cost, cost, log_depth, scale, penalty, base, step, n * count, count, weight, cap)

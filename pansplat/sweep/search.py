@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,9 +25,8 @@ from pansplat.sweep.axes import (
     mark_separating_planes,
     match_axes,
 )
-from pansplat.sweep.bend import BendConfig, bend_surfaces
+from pansplat.sweep.bend import bend_surfaces
 from pansplat.sweep.matching import (
-    AggregationConfig,
     DepthRange,
     HypothesisSet,
     MatchingConfig,
@@ -37,8 +36,8 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, PriorModel, apply_prior_cost
-from pansplat.sweep.straighten import StraightenConfig, straighten
+from pansplat.sweep.prior import DepthPrior, PriorEstimator, PriorModel, apply_prior_cost
+from pansplat.sweep.straighten import straighten
 from pansplat.sweep.surface import (
     PosedImages,
     Surface,
@@ -54,34 +53,25 @@ from pansplat.system.progress import report_progress
 _SMALL_HEIGHT = 96  # pixels, of the panoramas in which heights of the cameras over the floor are compared
 
 
+_MAX_CANDIDATES = 256  # largest number of hypotheses of a set at the coarse level
+_NEAR_MARGIN = 0.75  # the smallest depth of the search, relative to `near`
+_FAR_MARGIN = 10.0  # the largest one, relative to `far`: rooms are often larger than the range that was given
+_NARROW_CANDIDATES = (16, 8)  # hypotheses of a set at the two finer levels
+_MAX_NEIGHBOURS = 3  # other views, at most, that a view is matched against
+
+# Of a search near the surfaces of single views, by level: hypotheses, and the largest relative change of inverse depth
+_SINGLE_VIEW_CANDIDATES, _SINGLE_VIEW_REACH = (33, 25, 17), (0.4, 0.2, 0.1)
+_SINGLE_VIEW_PENALTY = 0.03  # of the largest change: walls without texture keep their place
+
+
 @dataclass(frozen=True)
 class SearchConfig:
     """Settings of the search."""
 
     finest_height: int = 512
     """Height of the finest level; larger panoramas are searched at this height."""
-    max_candidates: int = 256
-    """Largest number of hypotheses of a set at the coarse level."""
-    near_margin: float = 0.75
-    """The smallest depth of the search, relative to `near`."""
-    far_margin: float = 10.0
-    """The largest depth of the search, relative to `far`: rooms are often larger than the range that was given."""
-    narrow_candidates: tuple[int, int] = (16, 8)
-    """Hypotheses of a set at the two finer levels."""
     near_single_views: bool = False
     """Search near the surfaces of single views only: for a depth network of better shapes than those of matches."""
-    single_view_reach: tuple[float, float, float] = (0.4, 0.2, 0.1)
-    """Largest relative change of inverse depth that the levels of this search find."""
-    single_view_candidates: tuple[int, int, int] = (33, 25, 17)
-    single_view_penalty: float = 0.03
-    """Of the largest change: walls without texture keep their place."""
-    matching: MatchingConfig = field(default_factory=MatchingConfig)
-    aggregation: AggregationConfig = field(default_factory=AggregationConfig)
-    prior: PriorConfig = field(default_factory=PriorConfig)
-    bend: BendConfig = field(default_factory=BendConfig)
-    straighten: StraightenConfig = field(default_factory=StraightenConfig)
-    max_neighbours: int = 3
-    """Other views, at most, that a view is matched against."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +105,17 @@ def observe(
     height = min(posed.images.shape[1], config.finest_height)
     small = [resize_sphere(image, max(height // 2, 32)) for image in posed.images]
     axes = estimate_axes(small, posed.cam2world[:, :3, :3])
-    low, high = 1 / posed.far, 1 / (config.near_margin * posed.near)
-    depths = DepthRange(low / config.far_margin, low, high)
+    low, high = 1 / posed.far, 1 / (_NEAR_MARGIN * posed.near)
+    depths = DepthRange(low / _FAR_MARGIN, low, high)
     estimator = None
     if prior_model is not None:
         report_progress("estimating depth", 0.02)
-        estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], (low, high), config.prior)
-    neighbours = choose_nearest(posed.cam2world, config.max_neighbours, 1 / high)
+        estimator = PriorEstimator(prior_model, posed.images, posed.cam2world, axes[0], (low, high))
+    neighbours = choose_nearest(posed.cam2world, _MAX_NEIGHBOURS, 1 / high)
     if posed.measure_baseline(range(len(posed.images))) < ONE_POSITION * posed.near:
         return ObservedScene(posed, config, depths, neighbours, [axes] * len(posed.images), estimator=estimator)
     if estimator is not None:
-        neighbours = estimator.choose_neighbours(config.max_neighbours)
+        neighbours = estimator.choose_neighbours(_MAX_NEIGHBOURS)
 
     by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
     pairs = list_best_pairs(neighbours)
@@ -137,7 +127,7 @@ def observe(
     priors: Sequence[Sequence[DepthPrior]] = [()] * len(posed.images)
     if estimator is not None:
         views = _make_views(posed, min(height, _SMALL_HEIGHT))
-        priors = estimator.estimate_by_matching(views, neighbours, config.matching)
+        priors = estimator.estimate_by_matching(views, neighbours)
     return ObservedScene(posed, config, depths, neighbours, own_axes, priors, estimator)
 
 
@@ -156,7 +146,7 @@ def search(scene: ObservedScene) -> list[Surface]:
     straight = []
     for surface, axes, image, pose in zip(surfaces, scene.axes, posed.images, posed.cam2world, strict=True):
         down = pose[:3, :3].T @ axes[0]
-        log_depth = straighten(-np.log(surface.inverse_depth), image, down, scene.config.straighten)
+        log_depth = straighten(-np.log(surface.inverse_depth), image, down)
         straight.append(Surface(np.exp(-log_depth).clip(*scene.depths.limits)))
     return straight
 
@@ -170,7 +160,7 @@ def _search(scene: ObservedScene, finest_posed: PosedImages) -> list[Surface]:
         return _search_near_single_views(scene, heights)
     pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
-    counts = [int(np.clip(math.ceil(baseline / pixel), 48, config.max_candidates)) for baseline in baselines]
+    counts = [int(np.clip(math.ceil(baseline / pixel), 48, _MAX_CANDIDATES)) for baseline in baselines]
     report_progress("searching the whole depth range", 0.25)
     level = _SearchLevel(scene, heights[0])
     surfaces = [
@@ -187,18 +177,18 @@ def _search(scene: ObservedScene, finest_posed: PosedImages) -> list[Surface]:
             for surface, image in zip(surfaces, posed.images, strict=True)
         ]
         if sharp is not None and height == finest:
-            surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
+            surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp)
         level = _SearchLevel(scene, height, surfaces)
         surfaces = [
-            level.refine(view, config.narrow_candidates[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
+            level.refine(view, _NARROW_CANDIDATES[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
             for view, count in enumerate(counts)
         ]
-    return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp, config.bend)
+    return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp)
 
 
 def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> list[Surface]:
     """The surfaces of single views, bent at each level by a search near them."""
-    config, posed = scene.config, scene.posed
+    posed = scene.posed
     assert scene.estimator is not None
     log_depths, bent = [], []
     for sharp, (prior, *_) in zip(scene.estimator.sharpen(), scene.priors, strict=True):
@@ -209,7 +199,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> l
         small = [resize_sharp(log_depth, height) for log_depth in log_depths]
         level = _SearchLevel(scene, height, [Surface(np.exp(-log_depth)) for log_depth in small])
         found = [level.refine_near(view, n) for view in range(len(small))]
-        bent = bend_surfaces(posed.resize(height), found, scene.neighbours, small, config.bend)
+        bent = bend_surfaces(posed.resize(height), found, scene.neighbours, small)
         log_depths = [
             log_depth + resize_sphere(-np.log(surface.inverse_depth) - start, len(log_depth))
             for log_depth, surface, start in zip(log_depths, bent, small, strict=True)
@@ -236,7 +226,7 @@ class _SearchLevel:
     """All views at the height of one level of the search, with the surfaces found so far, if any."""
 
     def __init__(self, scene: ObservedScene, height: int, surfaces: Sequence[Surface] = ()) -> None:
-        self.posed, self.height, self.limits, self.config = scene.posed, height, scene.depths.limits, scene.config
+        self.posed, self.height, self.limits = scene.posed, height, scene.depths.limits
         self.surfaces, self.neighbours, self.axes = surfaces, scene.neighbours, scene.axes
         self.views = _make_views(scene.posed, height, surfaces)
 
@@ -255,7 +245,7 @@ class _SearchLevel:
         slot_map = np.stack([np.stack((s, (s - 1) * low / step + 0.5), axis=-1) for s in slopes], axis=2)
         cost = self._compute_cost(view, lambda other: self._mark_separating_planes(view, other, sets, inverse))
         if priors:
-            apply_prior_cost(cost, [prior.resize(self.height) for prior in priors], sets, self.config.prior)
+            apply_prior_cost(cost, [prior.resize(self.height) for prior in priors], sets)
         return self._select_hypotheses(view, sets, cost, slot_map.astype(np.float32), count)
 
     def _mark_separating_planes(
@@ -277,11 +267,11 @@ class _SearchLevel:
 
     def refine_near(self, view: int, level: int) -> Surface:
         """The best hypotheses near the surface, in steps of relative depth; changes have a penalty."""
-        count = self.config.single_view_candidates[level]
+        count = _SINGLE_VIEW_CANDIDATES[level]
         change = np.linspace(-1, 1, count, dtype=np.float32)
         known = self.surfaces[view].inverse_depth
-        steps = known * np.float32(2 * self.config.single_view_reach[level] / (count - 1))
-        return self._refine(view, [known], steps, self.config.single_view_penalty * np.abs(change))
+        steps = known * np.float32(2 * _SINGLE_VIEW_REACH[level] / (count - 1))
+        return self._refine(view, [known], steps, _SINGLE_VIEW_PENALTY * np.abs(change))
 
     def _refine(self, view: int, centres: list[np.ndarray], step: np.ndarray, penalty: np.ndarray) -> Surface:
         """The best of hypotheses a step (h, w) apart around each of some surfaces, with a penalty (count) each."""
@@ -300,14 +290,14 @@ class _SearchLevel:
             OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
             for other in self.neighbours[view]
         ]
-        return compute_matching_cost(self.views[view], others, self.limits, self.config.matching)
+        return compute_matching_cost(self.views[view], others, self.limits, MatchingConfig())
 
     def _select_hypotheses(
         self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int
     ) -> Surface:
         """The surface of lowest aggregated cost."""
         count = len(sets[0].penalty)
-        total = aggregate_costs(cost, self.views[view].image, slot_map, slots, self.config.aggregation)
+        total = aggregate_costs(cost, self.views[view].image, slot_map, slots)
         label, offset = select_labels(total, count)
         chosen, k = label // count, label % count
         base = np.stack([s.base for s in sets], axis=-1)

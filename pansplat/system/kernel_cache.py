@@ -3,7 +3,6 @@
 import atexit
 import os
 import shutil
-import stat
 import tempfile
 from collections.abc import MutableMapping
 
@@ -11,7 +10,7 @@ _VARIABLE = "NUMBA_CACHE_DIR"
 
 
 def choose_kernel_cache(package: str, environment: MutableMapping[str, str]) -> None:
-    """Set numba's cache folder to a private temporary one if its own choices are not writable.
+    """Set numba's cache folder to one that ends with the process if its own choices are not writable.
 
     Without a writable folder, numba refuses to define a kernel. Call this before numba is imported.
 
@@ -25,7 +24,8 @@ def choose_kernel_cache(package: str, environment: MutableMapping[str, str]) -> 
     user = environment.get("XDG_CACHE_HOME") or os.path.join(home, ".cache")
     if _can_make(os.path.join(package, "__pycache__")) or (os.path.isabs(user) and _can_make(user)):
         return
-    environment[_VARIABLE] = _make_private_folder()
+    environment[_VARIABLE] = folder = tempfile.mkdtemp(prefix="pansplat-kernels-")  # only this user can write it
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
 
 
 def _can_make(folder: str) -> bool:
@@ -42,18 +42,3 @@ def _is_read_only(folder: str) -> bool:
             return False
     except OSError:
         return True
-
-
-def _make_private_folder() -> str:
-    """A folder that only this user can write: kernels in it are executed. It is kept if its name is free."""
-    folder = os.path.join(tempfile.gettempdir(), f"pansplat-kernels-{os.getuid() if hasattr(os, 'getuid') else 0}")
-    try:
-        os.makedirs(folder, mode=0o700, exist_ok=True)
-        status = os.lstat(folder)
-        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
-            return folder
-    except (OSError, AttributeError):
-        pass
-    folder = tempfile.mkdtemp(prefix="pansplat-kernels-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,7 +22,7 @@ from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import blend_weights
 from pansplat.rendering.blend import blend
 from pansplat.rendering.image_planes import ImagePlane, image_planes, stitch_faces
-from pansplat.rendering.official import OFFICIAL, official_face_size, official_gaussians
+from pansplat.rendering.official import official_face_size, official_gaussians
 from pansplat.rendering.projection import ProjectedGaussians, compute_footprints, is_in_image, project_gaussians
 from pansplat.rendering.rasterize import RasterOptions, Rendering, rasterize
 from pansplat.training.config import Mixing, Style
@@ -123,8 +123,7 @@ class TargetRenderer:
         pose = face_poses(cam2world.double())[part.index]
         gaussians = self._select(gaussians, None)
         size = (self.face_size, self.face_size)
-        options = replace(self._options, stitching="seamless")
-        image = rasterize(gaussians, pose, size=size, layout="pinhole", **vars(options))
+        image = rasterize(gaussians, pose, size=size, layout="pinhole", **vars(self._options))
         return torch.cat((image.color, image.alpha[None]))
 
     def compose(
@@ -140,7 +139,7 @@ class TargetRenderer:
             if self.style == "panorama":
                 image = torch.cat(images, dim=1)
             else:
-                image = stitch_faces(torch.stack(images), self.size, stitching=self._options.stitching)
+                image = stitch_faces(torch.stack(images), self.size, official=self.style == "original")
             panoramas.append(Rendering(image[:3], image[3], torch.zeros_like(image[3])))
         return self._blend(panoramas, cam2world, context)
 
@@ -187,7 +186,7 @@ class TargetRenderer:
 
     @property
     def _options(self) -> RasterOptions:
-        return OFFICIAL if self.style == "original" else RasterOptions()
+        return RasterOptions("ewa" if self.style == "original" else "ray")
 
 
 @dataclass(frozen=True)
@@ -217,8 +216,7 @@ def find_visible_gaussians(
             _without_colours(gaussians, slice(start, start + _CHUNK)),
             pose,
             filter_variance=options.filter_variance(regions[0].plane.pixel_angle),
-            compensate=options.compensate,
-            exact=False,
+            exact=options.kernel == "ray",
         )
         for region, masks in zip(regions, found, strict=True):
             masks.append(_is_in_region(projected, region, options))

@@ -13,7 +13,9 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import empty_gaussians
 from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, fuse_views, refinement_fingerprint
+from pansplat.refinement import refinement as module
 from pansplat.refinement.budget import merge_to
+from pansplat.refinement.parameters import LEARNING_RATES
 from pansplat.rendering import rasterize
 from pansplat.system.progress import show_progress
 
@@ -46,7 +48,6 @@ def test_refinement_brings_the_image_between_the_cameras_near_the_truth(room) ->
     refined, report = _refine(room, steps=60)
     assert room.error(refined, middle) < 0.5 * room.error(room.predicted, middle)
     assert report.after < 0.5 * report.before and report.steps <= 60
-    assert (report.history[0][0], report.history[0][2]) == (0, report.before)
     assert torch.equal(refined.cam2world, room.predicted.cam2world)
 
 
@@ -64,13 +65,12 @@ def test_the_exposure_of_a_photograph_is_found(room) -> None:
     scene = dataclasses.replace(
         room.predicted, gaussians=dataclasses.replace(room.predicted.gaussians, harmonics=darker)
     )
-    refined, report = _refine(room, views=dataclasses.replace(room.views, images=images), scene=scene, steps=60)
-    assert refined.gains == report.gains
-    ratios = [b / a for a, b in zip(*report.gains, strict=True)]
+    refined, _ = _refine(room, views=dataclasses.replace(room.views, images=images), scene=scene, steps=60)
+    ratios = [b / a for a, b in zip(*refined.gains, strict=True)]
     assert ratios == pytest.approx([0.8] * 3, abs=0.03)
 
 
-def test_pose_errors_are_corrected(room) -> None:
+def test_pose_errors_are_corrected(room, monkeypatch) -> None:
     offset = torch.eye(4, dtype=torch.float64)
     angle = math.radians(0.8)
     offset[0, 0] = offset[2, 2] = math.cos(angle)
@@ -87,7 +87,8 @@ def test_pose_errors_are_corrected(room) -> None:
         room.truth, cam2world=poses, gaussians=dataclasses.replace(gaussians, means=means.float())
     )
     views = dataclasses.replace(room.views, cam2world=poses)
-    refined, _ = _refine(room, scene=scene, views=views, steps=150, poses=True, pose_hold=1.0)
+    monkeypatch.setattr(module, "_POSE_HOLD", 1.0)
+    refined, _ = _refine(room, scene=scene, views=views, steps=150, poses=True)
 
     def relative_angle(pair: torch.Tensor) -> float:
         rotation = (invert_pose(pair[0]) @ pair[1])[:3, :3]
@@ -98,11 +99,12 @@ def test_pose_errors_are_corrected(room) -> None:
     assert torch.equal(fixed.cam2world, poses)
 
 
-def test_a_scene_that_gets_worse_is_returned_unchanged(room) -> None:
-    rates = dataclasses.replace(RefineConfig().rates, distance=1.0, scale=3.0, color=5.0)
-    kept, report = _refine(room, scene=room.truth, steps=6, rates=rates)
+def test_a_scene_that_gets_worse_is_returned_unchanged(room, monkeypatch) -> None:
+    for name, rate in {"distance": 1.0, "scale": 3.0, "color": 5.0}.items():
+        monkeypatch.setitem(LEARNING_RATES, name, rate)
+    kept, report = _refine(room, scene=room.truth, steps=6)
     assert report.stopped == "worse" and kept is room.truth
-    kept, report = _refine(room, scene=room.truth, steps=6, rates=rates, gaussians=900)
+    kept, report = _refine(room, scene=room.truth, steps=6, gaussians=900)
     assert report.stopped == "worse" and len(kept.gaussians) <= 900
 
 
@@ -114,7 +116,7 @@ def test_a_run_is_judged_before_it_fits_the_held_out_blocks(room, monkeypatch: p
     report = refinement.run(steps=8)
     assert (report.stopped, report.before, report.after) == ("worse", 1.0, 2.0)
     assert refinement.scene() is room.predicted and report.steps == len(fractions) == 6
-    assert max(fractions) < RefineConfig().release
+    assert max(fractions) < module._RELEASE
 
 
 def test_a_stagnating_run_ends_early_with_its_last_part(room) -> None:
@@ -236,7 +238,7 @@ def test_invalid_limits_are_refused(room, limits: dict) -> None:
 
 def test_the_fingerprint_depends_on_the_settings() -> None:
     assert refinement_fingerprint() == refinement_fingerprint(RefineConfig())
-    assert refinement_fingerprint() != refinement_fingerprint(RefineConfig(hold=1.0))
+    assert refinement_fingerprint() != refinement_fingerprint(RefineConfig(poses=True))
 
 
 @pytest.mark.parametrize("joint", [False, True])

@@ -9,8 +9,8 @@ from synthetic_scenes import make_balls
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.rendering import rasterize
-from pansplat.rendering.color_fit import ColorFitConfig, fit_colors
+from pansplat.rendering import color_fit, rasterize
+from pansplat.rendering.color_fit import fit_colors
 
 SIZE = (24, 48)
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
@@ -36,7 +36,9 @@ def _draw(gaussians: Gaussians, view: int) -> torch.Tensor:
 
 def _fit(gaussians: Gaussians, images: torch.Tensor, masks: torch.Tensor | None = None, steps: int = 3) -> Gaussians:
     masks = torch.ones(2, *SIZE, dtype=torch.bool) if masks is None else masks
-    return fit_colors(gaussians, images, POSES, masks, ColorFitConfig(steps))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(color_fit, "_STEPS", steps)
+        return fit_colors(gaussians, images, POSES, masks)
 
 
 def _grey(gaussians: Gaussians) -> Gaussians:

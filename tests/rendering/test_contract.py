@@ -17,11 +17,10 @@ from pansplat.gaussians.scene import Gaussians
 
 Case = tuple[Gaussians, dict[str, Any]]
 PINHOLE: dict[str, Any] = {"layout": "pinhole"}
-LIGHT: dict[str, Any] = {"layout": "pinhole", "lowpass": "3dgs", "size": (5, 9)}
+LIGHT: dict[str, Any] = {"layout": "pinhole", "size": (5, 9)}
 LAYOUTS = (("equirect", "ray"), ("pinhole", "ray"), ("cubemap", "ray"), ("pinhole", "ewa"), ("cubemap", "ewa"))
-LOWPASSES = ("angular", "3dgs")
 RED_GREEN = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
-INTERPRETED = ("one, equirect", "small, cubemap ewa angular z", "inside", "stack of 0.9", "odd size 5", "needles x ray")
+INTERPRETED = ("one, equirect", "small, cubemap ewa", "inside", "stack of 0.9", "odd size 5", "needles x ray")
 """The cases that also run under Triton's interpreter; a GPU runs all."""
 
 
@@ -44,12 +43,9 @@ def list_cases() -> Iterator[tuple[str, Case]]:
     channels = change(small, harmonics=small.harmonics.repeat(1, 1, 11)[:, :, :32])
     for layout, kernel in LAYOUTS:
         way = {"layout": layout, "kernel": kernel, "vertical_fov_degrees": 80.0, "pose": POSE}
-        for lowpass in LOWPASSES:
-            for order in ("radial", "z"):
-                options = way | {"lowpass": lowpass, "order": order, "face_size": 9}
-                yield f"small, {layout} {kernel} {lowpass} {order}", (small, options)
-            large = {"size": (50, 70) if layout == "pinhole" else (40, 80), "lowpass": lowpass}
-            yield f"crowd, {layout} {kernel} {lowpass}", (crowd, way | large)
+        yield f"small, {layout} {kernel}", (small, way | {"face_size": 9})
+        large = {"size": (50, 70) if layout == "pinhole" else (40, 80)}
+        yield f"crowd, {layout} {kernel}", (crowd, way | large)
         yield f"one, {layout}{' ewa' * (kernel == 'ewa')}", (one, {"layout": layout, "kernel": kernel})
     for count in (1, 2, 32):
         yield f"{count} channels", (change(small, harmonics=channels.harmonics[..., :count]), {})
@@ -61,14 +57,13 @@ def list_cases() -> Iterator[tuple[str, Case]]:
     on_edge, at_corner = make_spheres((1.4, 0, 1.4), 0.3), make_spheres((1.2, 1.2, 1.2), 0.4)
     for kernel in ("ray", "ewa"):
         for num in (1, 2, 3, 5, 7):
-            faces = {"size": (7, 15), "layout": "cubemap", "face_size": num, "kernel": kernel}
+            size = (7, 15) if kernel == "ray" else (8, 16)
+            faces = {"size": size, "layout": "cubemap", "face_size": num, "kernel": kernel}
             yield f"edge, {kernel} of {num} pixels", (on_edge, faces)
             yield f"corner, {kernel} of {num} pixels", (at_corner, faces)
         beside = [(14 * 0.3, 0.1, 0.3), (-0.5, 0.9, 0.21), (0.3, 1.4, 1.0), (0.1, -0.1, 2.0)]
         outside = make_spheres(beside, [1.5, 0.4, 0.5, 0.3], colours=noise(4, 3).abs())
-        for lowpass in LOWPASSES:
-            wide = PINHOLE | {"kernel": kernel, "lowpass": lowpass, "order": "z", "fields": NO_QUATS}
-            yield f"outside the view, {kernel} {lowpass}", (outside, wide)
+        yield f"outside the view, {kernel}", (outside, PINHOLE | {"kernel": kernel, "fields": NO_QUATS})
         behind = make_spheres([(0, 0, -2.0), (0.5, 0.2, -2.0), (1.0, 0, -0.9)], 0.1)
         yield f"behind, {kernel}", (behind, PINHOLE | {"vertical_fov_degrees": 100.0, "kernel": kernel})
     for name, mean in {"up": (0, -2.0, 0), "down": (0, 2.0, 0), "seam": (0, 0.3, -2.0)}.items():
@@ -86,39 +81,35 @@ def list_cases() -> Iterator[tuple[str, Case]]:
     # Order
     pair = make_spheres([(0.4, 0.1, 2.0)] * 2, 0.4, colours=RED_GREEN)
     ties = Gaussians.cat([pair, make_scene(9, degree=0), pair.select(torch.tensor([1, 0, 0]))])
-    for layout in ("equirect", "cubemap"):
-        for order in ("radial", "z"):
-            yield f"ties, {layout} {order}", (ties, {"layout": layout, "order": order})
+    for layout, kernel in (("equirect", "ray"), ("cubemap", "ray"), ("cubemap", "ewa")):
+        yield f"ties, {layout} {kernel}", (ties, {"layout": layout, "kernel": kernel})
 
     # Shapes
     for axis, name in enumerate("xyz"):
         for kernel in ("ray", "ewa"):
-            scales = torch.full((2, 3), 1e-4, dtype=torch.float64)
+            scales = torch.full((2, 3), 1e-2 if kernel == "ray" else 1e-4, dtype=torch.float64)  # the filter hides less
             scales[:, axis] = 1.0
             needles = change(
                 make_spheres([(0.1, 0.1, 2.0), (-0.6, 0.3, 1.5)], colours=noise(2, 3).abs()),
                 scales=scales,
                 quats=[[0.95, 0.1, -0.05, 0.2], [1.0, 0, 0, 0]],
             )
-            options = PINHOLE | {"kernel": kernel, "lowpass": "3dgs", "fields": NO_QUATS}
+            options = PINHOLE | {"kernel": kernel, "fields": NO_QUATS}
             yield f"needles {name} {kernel}", (needles, options)
     flat = {"disc": (0.5, 0.5, 0), "disc on edge": (0, 0.5, 0.5), "line": (0, 0, 0.5), "aside": (0.5, 0, 0)}
     for name, scales in (flat | {"point": (0, 0, 0)}).items():
         for kernel in ("ray", "ewa"):
             shape = change(make_spheres((0.02, 0.01, 2.0)), scales=[scales])
-            options = PINHOLE | {"kernel": kernel, "lowpass": "3dgs", "fields": NO_QUATS}
+            options = PINHOLE | {"kernel": kernel, "fields": NO_QUATS}
             yield f"{name}, {kernel}", (shape, options)
     count, apart, focal = 9, 5, 1000.0
     grid = torch.stack(torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij"), dim=-1).double()
     grid = (grid.reshape(-1, 2) * (apart + 1 / count) + 2.5 - 0.5 * count * apart) / focal  # all sub-pixel positions
     ahead = torch.nn.functional.normalize(torch.nn.functional.pad(grid, (0, 1), value=1.0), dim=1)
     fov = 2 * math.degrees(math.atan(0.5 * count * apart / focal))
-    for lowpass in LOWPASSES:
-        options = PINHOLE | {"size": (count * apart,) * 2, "vertical_fov_degrees": fov, "lowpass": lowpass}
-        yield (
-            f"specks, {lowpass}",
-            (make_spheres(ahead, 0.05 / focal, 1.0), options | {"fields": NO_QUATS, "slack": 4}),
-        )
+    options = PINHOLE | {"size": (count * apart,) * 2, "vertical_fov_degrees": fov, "fields": NO_QUATS, "slack": 4}
+    for kernel in ("ray", "ewa"):
+        yield f"specks, {kernel}", (make_spheres(ahead, 0.05 / focal, 1.0), options | {"kernel": kernel})
     turned = make_scene(8, scale=0.3, degree=0)
     for factor in (-1.0, 2.0, 1e-6, 1e6):
         yield f"quaternions times {factor}", (change(turned, quats=factor * turned.quats), {"pose": POSE})
@@ -126,7 +117,10 @@ def list_cases() -> Iterator[tuple[str, Case]]:
 
     # Light
     for opacity in (0.0, -0.5, -1e29, (1 - 1e-3) / 255, (1 + 1e-3) / 255, 0.5, 1.0, 5.0, 1e29):
-        yield f"opacity {opacity:.4g}", (make_spheres((0, 0, 2.0), 1.9, opacity), LIGHT | {"size": (5, 5)})
+        yield (
+            f"opacity {opacity:.4g}",
+            (make_spheres((0, 0, 2.0), 1.9, opacity), LIGHT | {"size": (5, 5), "vertical_fov_degrees": 10.0}),
+        )
     for opacity in (0.3, 0.9, 0.999):
         far = 2 + 0.01 * torch.arange(12, dtype=torch.float64)
         means = torch.stack((0 * far, 0 * far, far), dim=1) + 0.2 * noise(12, 3, seed=2) * torch.tensor((1.0, 1, 0))

@@ -71,7 +71,7 @@ def test_gradients_are_those_of_the_reference(balls):
     assert float(means.grad[0, 0]) == pytest.approx(float(expected), rel=0.01)
 
 
-def test_unusable_gaussians_are_left_out_and_counted(make_scene):
+def test_unusable_gaussians_are_left_out(make_scene):
     scene = make_scene(30).to(dtype=torch.float32)
     scene.means[5] = torch.tensor((-0.06, 0.0, 0.0))  # nearer than 0.05 m to the eye of the last column only
     broken = dataclasses.replace(scene, means=scene.means.clone(), harmonics=scene.harmonics.clone())
@@ -80,7 +80,6 @@ def test_unusable_gaussians_are_left_out_and_counted(make_scene):
     for backend in ("numba", "torch"):
         rendering = rasterize(broken, ORIGIN, size=(12, 24), eye_offset=0.1, backend=backend)
         expected = rasterize(scene.select(kept), ORIGIN, size=(12, 24), eye_offset=0.1, backend=backend)
-        assert rendering.info is not None and (rendering.info.dropped, rendering.info.near) == (2, 0)
         assert torch.equal(rendering.color, expected.color)
     empty = rasterize(scene.select(kept & False), ORIGIN, size=(12, 24), eye_offset=0.1)
     assert not empty.alpha.any()

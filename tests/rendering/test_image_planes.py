@@ -27,9 +27,9 @@ def test_stitching_reproduces_the_direction_of_every_pixel_across_edges_and_corn
 
 def test_official_stitching_refuses_other_sizes():
     with pytest.raises(ValueError, match="must be 2:1"):
-        stitch_faces(torch.zeros(6, 1, 4, 4), (8, 8), stitching="official")
+        stitch_faces(torch.zeros(6, 1, 4, 4), (8, 8), official=True)
     with pytest.raises(ValueError, match="multiple of 4, got 6"):
-        stitch_faces(torch.zeros(6, 1, 4, 4), (6, 12), stitching="official")
+        stitch_faces(torch.zeros(6, 1, 4, 4), (6, 12), official=True)
 
 
 @pytest.mark.shared
@@ -41,7 +41,7 @@ def test_official_faces_equal_the_fixture(golden):
 def test_official_stitching_equals_the_fixture(golden):
     fixtures = golden("units")
     expected = fixtures["cubemap.pano_out"][0].double()
-    got = stitch_faces(fixtures["cubemap.faces_in"][0].double(), (64, 128), stitching="official")
+    got = stitch_faces(fixtures["cubemap.faces_in"][0].double(), (64, 128), official=True)
     # The official code samples float32 positions in a strip of six padded faces, 204 pixels long, where neighbouring
     # numbers are 1.5e-5 apart; the fixture's faces are noise, up to 1 from pixel to pixel.
     assert float((got - expected).abs().max()) < 3e-5
@@ -50,7 +50,7 @@ def test_official_stitching_equals_the_fixture(golden):
 @pytest.mark.shared
 def test_the_two_stitchings_differ_only_next_to_the_up_and_down_faces(golden):
     faces = golden("units")["cubemap.faces_in"][0].double()
-    official, seamless = (stitch_faces(faces, (64, 128), stitching=s) for s in ("official", "seamless"))
+    official, seamless = (stitch_faces(faces, (64, 128), official=o) for o in (True, False))
     differ = (official - seamless).abs().amax(dim=0) > 1e-12
     assert 0 < int(differ.sum()) <= 96
     up_or_down = face_of(pixel_directions(64, 128, dtype=torch.float64)) >= 4

@@ -30,8 +30,6 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import Rendering
 
-PINHOLE = {"layout": "pinhole", "lowpass": "3dgs"}
-
 
 def assert_same_bits(got: Rendering, expected: Rendering) -> None:
     for name in ("color", "alpha", "depth"):
@@ -56,7 +54,6 @@ def test_an_empty_scene_is_background_and_gradients_of_zero(layout: str, render:
         expected = torch.tensor((0.1, 0.25, 0.5), dtype=render.dtype)[:, None, None].expand(3, *render.size)
         assert torch.equal(got.color, expected), name
         assert float(got.alpha.abs().max()) == float(got.depth.abs().max()) == 0
-        assert got.info is not None and got.info.intersections == 0
         for field, gradient in find_gradients(render, scene, layout=layout).items():
             shape = (4, 4) if field == "pose" else getattr(scene, field).shape
             assert gradient.shape == shape and not gradient.any(), (name, field)
@@ -73,7 +70,6 @@ def test_a_number_that_is_not_finite_drops_only_its_gaussian(field: str, render:
         value.reshape(6, -1)[2, -1] = poison
         poisoned = make_leaves(dataclasses.replace(scene, **{field: value}))
         got = render(poisoned, POSE)
-        assert got.info is not None and got.info.dropped == 1
         assert_same_bits(got, expected)
         measure_loss(got).backward()
         for name in FIELDS:
@@ -82,10 +78,9 @@ def test_a_number_that_is_not_finite_drops_only_its_gaussian(field: str, render:
 
 
 def test_scales_far_larger_than_the_distance_are_dropped_and_far_smaller_ones_vanish(render: Renderer) -> None:
-    for sigma, dropped in ((1e15, 1), (1e-25, 0)):
+    for sigma in (1e15, 1e-25):
         scene = make_spheres([(0, 0, 2.0), (0.5, 0.2, 1.0)], [sigma, 0.2])
         got = render(scene)
-        assert got.info is not None and got.info.dropped == dropped
         assert torch.equal(got.color, render(scene.select(torch.tensor([1]))).color)
         for name, gradient in find_gradients(render, scene).items():
             assert torch.isfinite(gradient).all() and (name == "pose" or not gradient[0].any())
@@ -137,12 +132,9 @@ def draw_options(draw) -> dict:
         "layout": draw(st.sampled_from(("equirect", "cubemap", "pinhole"))),
         "size": (draw(st.integers(1, 9)), draw(st.integers(1, 17))),
         "kernel": draw(st.sampled_from(("ray", "ewa"))),
-        "order": draw(st.sampled_from(("radial", "z"))),
-        "lowpass": draw(st.sampled_from(("angular", "3dgs"))),
         "near": draw(st.sampled_from((1e-10, 0.05, 1.0, 1e10))),
         "vertical_fov_degrees": draw(st.sampled_from((0.1, 60.0, 90.0, 179.0))),
         "face_size": draw(st.sampled_from((None, 1, 2, 5))),
-        "stitching": draw(st.sampled_from(("seamless", "seamless", "official"))),
     }
 
 
@@ -172,7 +164,7 @@ DISTANT = make_spheres([0.0, -0.3, 1e12], opacity=1e29)
 @pytest.mark.slow
 @settings(QUIET, max_examples=60)
 @given(scene=draw_scene(), options=draw_options())
-@example(scene=DISTANT, options={**PINHOLE, "size": (1, 14), "vertical_fov_degrees": 0.1})
+@example(scene=DISTANT, options={"layout": "pinhole", "size": (1, 14), "vertical_fov_degrees": 0.1})
 def test_extreme_numbers_give_finite_images_and_gradients(render: Renderer, scene: Gaussians, options: dict) -> None:
     if render.interpreted:
         options = {**options, "size": (3, 6), "face_size": 3}
@@ -234,7 +226,7 @@ def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(re
 
 def test_gradients_of_a_saturated_pixel_are_exactly_zero_behind_the_front(render: Renderer) -> None:
     scene = make_leaves(_stack(300 if render.interpreted else 3000, 0.95).to(dtype=render.dtype))
-    got = render(scene, size=(1, 1), **PINHOLE)
+    got = render(scene, size=(1, 1), layout="pinhole", vertical_fov_degrees=10.0)  # the filter hides little
     got.color.sum().backward()
     assert torch.isfinite(got.color).all() and float(scene.opacities.grad[0].abs()) > 0.01
     for field in (scene.means, scene.opacities, scene.harmonics):

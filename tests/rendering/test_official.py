@@ -1,4 +1,4 @@
-"""`OFFICIAL` against a dense version of the official rasteriser, without its two cuts."""
+"""Kernel "ewa" against a dense version of the official rasteriser, without its two cuts."""
 
 import pytest
 import torch
@@ -8,9 +8,8 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.cubemap import face_poses
 from pansplat.rendering import rasterize
 from pansplat.rendering.image_planes import stitch_faces
-from pansplat.rendering.official import OFFICIAL
 
-_OPTIONS = {**vars(OFFICIAL), "near": 0.45}
+_OPTIONS = {"kernel": "ewa", "near": 0.45}
 
 
 def _official_face(scene: Gaussians, pose: torch.Tensor, num: int, near: float) -> torch.Tensor:
@@ -50,7 +49,7 @@ def _official_face(scene: Gaussians, pose: torch.Tensor, num: int, near: float) 
 
 def _official(scene: Gaussians, pose: torch.Tensor, height: int, near: float) -> torch.Tensor:
     faces = [_official_face(scene, p, height // 2, near) for p in face_poses(pose)]
-    return stitch_faces(torch.stack(faces), (height, 2 * height), stitching="official")
+    return stitch_faces(torch.stack(faces), (height, 2 * height), official=True)
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ def outside(make_scene):
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.3])
-def test_official_options_equal_the_official_rasteriser_without_its_two_cuts(scale, outside, pose):
+def test_the_ewa_kernel_equals_the_official_rasteriser_without_its_two_cuts(scale, outside, pose):
     scene = outside(150, scale)
     expected = _official(scene, pose, 32, 0.45)
     got = rasterize(scene, pose, size=(32, 64), face_size=16, layout="cubemap", **_OPTIONS)

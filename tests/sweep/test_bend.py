@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from pansplat.geometry.equirect import row_weights
+from pansplat.sweep import bend
 from pansplat.sweep.bend import (
-    BendConfig,
     bend_surfaces,
     fit_field,
     measure_evidence,
 )
 from pansplat.sweep.surface import Surface
 
-CONFIG = BendConfig()
 HEIGHT = 48
 SHAPE = (HEIGHT, 2 * HEIGHT)
 
@@ -30,14 +29,14 @@ def _area() -> np.ndarray:
 
 def test_without_evidence_only_the_scale_changes():
     target = np.random.default_rng(2).normal(0.4, 0.3, SHAPE)
-    field = fit_field(target, np.zeros(SHAPE), np.zeros(SHAPE), CONFIG)
+    field = fit_field(target, np.zeros(SHAPE), np.zeros(SHAPE))
     assert np.ptp(field) < 1e-12 and abs(field[0, 0] - 0.4) < 0.03
 
 
 def test_dense_evidence_is_followed():
     rows, columns = np.indices(SHAPE)
     target = 0.2 + 0.1 * np.sin(2 * math.pi * columns / SHAPE[1]) * np.sin(math.pi * rows / HEIGHT)
-    field = fit_field(target, np.ones(SHAPE), np.zeros(SHAPE), CONFIG)
+    field = fit_field(target, np.ones(SHAPE), np.zeros(SHAPE))
     assert np.abs(field - target)[4:-4].max() < 0.01
 
 
@@ -45,7 +44,7 @@ def test_few_false_matches_bend_nothing():
     generator = np.random.default_rng(3)
     is_false = generator.random(SHAPE) < 0.03
     target = np.where(is_false, generator.uniform(-2, 2, SHAPE), 0.1)
-    field = fit_field(target, np.ones(SHAPE), np.zeros(SHAPE), CONFIG)
+    field = fit_field(target, np.ones(SHAPE), np.zeros(SHAPE))
     assert np.abs(field - 0.1)[4:-4].max() < 0.02
 
 
@@ -55,32 +54,32 @@ def test_a_field_does_not_cross_a_discontinuity_of_the_single_view():
     log_depth = np.where(is_near, 0.0, 1.5)
     target = np.where(is_near, 0.25, 0.0)
     evidence = (np.random.default_rng(4).random(SHAPE) < 0.3).astype(float)
-    field = fit_field(target, evidence, log_depth, CONFIG)
+    field = fit_field(target, evidence, log_depth)
     assert np.abs(field - target)[4:-4].max() < 0.03
-    blurred = fit_field(target, evidence, np.zeros(SHAPE), CONFIG)
+    blurred = fit_field(target, evidence, np.zeros(SHAPE))
     assert np.abs(blurred - target)[4:-4].max() > 0.06, "without the discontinuity it does"
 
 
 def test_rolling_the_panorama_rolls_the_field():
     generator = np.random.default_rng(5)
     target, evidence, log_depth = (generator.random(SHAPE) for _ in range(3))
-    field = fit_field(target, evidence, 0.1 * log_depth, CONFIG)
-    rolled = fit_field(*(np.roll(m, 37, axis=1) for m in (target, evidence, 0.1 * log_depth)), CONFIG)
+    field = fit_field(target, evidence, 0.1 * log_depth)
+    rolled = fit_field(*(np.roll(m, 37, axis=1) for m in (target, evidence, 0.1 * log_depth)))
     assert np.allclose(np.roll(field, 37, axis=1), rolled, atol=1e-9)
 
 
 @pytest.mark.parametrize("box", [None, ((0.9, 0.2, 0.6), (1.6, 1.2, 1.4))])
-def test_evidence_is_where_both_views_have_the_true_surface(make_room, box):
+def test_evidence_is_where_both_views_have_the_true_surface(make_room, box, monkeypatch):
     room = make_room(box=box)
     observed = room.observe(HEIGHT)
     surfaces = [_surface(depth) for depth in observed.depths]
-    config = dataclasses.replace(CONFIG, full_parallax=0.05)
-    evidence = measure_evidence(observed.posed, surfaces, 0, [1], config)
+    monkeypatch.setattr(bend, "_FULL_PARALLAX", 0.05)
+    evidence = measure_evidence(observed.posed, surfaces, 0, [1])
     assert (evidence * _area()).sum() / _area().sum() > 0.6
     wrong = [surfaces[0], _surface(1.3 * observed.depths[1])]
-    assert measure_evidence(observed.posed, wrong, 0, [1], config).mean() < 0.1
+    assert measure_evidence(observed.posed, wrong, 0, [1]).mean() < 0.1
     masked = dataclasses.replace(observed.posed, masks=np.zeros_like(observed.posed.masks))
-    assert not measure_evidence(masked, surfaces, 0, [1], config).any()
+    assert not measure_evidence(masked, surfaces, 0, [1]).any()
 
 
 def test_a_distorted_single_view_is_bent_to_the_true_surface(make_room):
@@ -91,7 +90,7 @@ def test_a_distorted_single_view_is_bent_to_the_true_surface(make_room):
     found = [_surface(depth) for depth in observed.depths * false]
     columns = np.arange(2 * HEIGHT)
     log_depths = [np.log(2 * depth) + 0.12 * np.sin(2 * math.pi * columns / len(columns)) for depth in observed.depths]
-    bent = bend_surfaces(observed.posed, found, [[1], [0]], log_depths, CONFIG)
+    bent = bend_surfaces(observed.posed, found, [[1], [0]], log_depths)
     for surface, depth, before in zip(bent, observed.depths, log_depths, strict=True):
         error = np.abs(np.log(surface.inverse_depth * depth))
         scaled = np.abs(before - np.median(before - np.log(depth)) - np.log(depth))

@@ -12,26 +12,35 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import interpolate_poses, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
-from pansplat.sweep.lift import NUM_LEVELS, LiftConfig, _estimate_opacity, _PosedSurfaces
+from pansplat.sweep import lift as module
+from pansplat.sweep.lift import (
+    _BACKGROUND_DEPTH,
+    _CONSISTENT_OPACITY,
+    _FOOTPRINT,
+    _SINGLE_VIEW_OPACITY,
+    NUM_LEVELS,
+    _estimate_opacity,
+    _PosedSurfaces,
+)
 from pansplat.sweep.lift import lift as lift_views
 from pansplat.sweep.surface import PosedImages, Surface
 
 
-def lift(posed: PosedImages, surfaces: list[Surface], config: LiftConfig) -> Gaussians:
+def lift(posed: PosedImages, surfaces: list[Surface]) -> Gaussians:
     """Lift each view with all others as its neighbours."""
     views = range(len(surfaces))
-    return lift_views(posed, surfaces, config, [[other for other in views if other != view] for view in views])
+    return lift_views(posed, surfaces, [[other for other in views if other != view] for view in views])
 
 
 @pytest.fixture(scope="module")
 def gaussians(small_furnished_room) -> Gaussians:
-    return lift(small_furnished_room.posed, small_furnished_room.surfaces, LiftConfig())
+    return lift(small_furnished_room.posed, small_furnished_room.surfaces)
 
 
 @pytest.fixture(scope="module")
 def exact(small_furnished_room) -> Gaussians:
     """Of the true depth."""
-    return lift(small_furnished_room.posed, small_furnished_room.make_exact_surfaces(), LiftConfig())
+    return lift(small_furnished_room.posed, small_furnished_room.make_exact_surfaces())
 
 
 def _render(gaussians: Gaussians, observed, pose: np.ndarray):
@@ -104,7 +113,7 @@ def test_masked_pixels_make_no_gaussians(small_furnished_room):
     masks = posed.masks.copy()
     masks[0, -16:] = False  # the nadir, 45 degrees and steeper
     masks[1] = False
-    gaussians = lift(dataclasses.replace(posed, masks=masks), surfaces, LiftConfig())
+    gaussians = lift(dataclasses.replace(posed, masks=masks), surfaces)
     assert (gaussians.views == 0).all()
     own = gaussians.means.double().numpy() - posed.cam2world[0, :3, 3]
     steep = np.degrees(np.arcsin(own[:, 1] / np.linalg.norm(own, axis=1)))
@@ -124,21 +133,21 @@ def test_only_image_detail_makes_gaussians_of_level_0():
     white = np.ones((64, 128, 3), np.float32)
     noise = np.random.default_rng(0).random((64, 128, 3)).astype(np.float32)
     half = np.where(np.arange(128)[None, :, None] < 64, white, noise)
-    fine = [int((lift(*_sphere_around(image), LiftConfig()).levels == 0).sum()) for image in (white, half, noise)]
+    fine = [int((lift(*_sphere_around(image)).levels == 0).sum()) for image in (white, half, noise)]
     assert fine[0] == 0
     assert fine[2] == 2 * lattice_size(128)
     assert 0.5 * fine[2] < fine[1] < 0.6 * fine[2]
 
 
 def test_gaussians_of_a_sphere_lie_on_the_fibonacci_lattices_at_its_radius():
-    gaussians = lift(*_sphere_around(np.ones((64, 128, 3), np.float32)), LiftConfig())
+    gaussians = lift(*_sphere_around(np.ones((64, 128, 3), np.float32)))
     radius = gaussians.means.norm(dim=1)
-    for level, factor in zip((1, 2, 3), (1.0, *LiftConfig().background_depth), strict=True):
+    for level, factor in zip((1, 2, 3), (1.0, *_BACKGROUND_DEPTH), strict=True):
         depth = 3.0 * factor
         chosen = gaussians.levels == level
         assert int(chosen.sum()) == 2 * lattice_size(128 >> level)
         assert torch.allclose(radius[chosen], torch.tensor(depth), rtol=1e-4)
-        size = LiftConfig().footprint * math.sqrt(4 * math.pi / lattice_size(128 >> level)) * depth
+        size = _FOOTPRINT * math.sqrt(4 * math.pi / lattice_size(128 >> level)) * depth
         assert torch.allclose(gaussians.scales[chosen][:, :2], torch.tensor(size), rtol=1e-3)
 
 
@@ -147,7 +156,7 @@ def test_points_in_the_consistent_free_space_of_another_view_are_dropped(make_ro
     observed = room.observe(64, [*room.two_poses(), room.pose((0.1, -0.1, -0.6))])
     surfaces = observed.make_exact_surfaces()
     surfaces[0].inverse_depth[20:30, 50:70] *= 2.0  # a surface in the free space of the other views
-    gaussians = lift(observed.posed, surfaces, LiftConfig())
+    gaussians = lift(observed.posed, surfaces)
     for level in (0, 1):
         chosen = (gaussians.views == 0) & (gaussians.levels == level)
         assert (room.wall_distances(gaussians.means[chosen].numpy()).min(axis=1) < 0.15).mean() > 0.97
@@ -160,18 +169,16 @@ def test_points_in_the_free_space_of_more_views_than_confirm_them_are_not_kept(o
     far = Surface(near.inverse_depth / 2)
     posed = PosedImages(posed.images[[0] * 4], posed.cam2world[[0] * 4], posed.masks[[0] * 4], posed.near, posed.far)
     certain = [np.ones((16, 32), bool)] * 4
-    scene = _PosedSurfaces(posed, [near, far, near, far], [others], certain, LiftConfig())
+    scene = _PosedSurfaces(posed, [near, far, near, far], [others], certain)
     opacity, kept = _estimate_opacity(np.array(((0.0, 0, 3), (0, 3, 0))), scene, 0)
     assert (kept == is_kept).all()
-    assert (opacity == (LiftConfig().consistent_opacity if 2 in others else LiftConfig().single_view_opacity)).all()
+    assert (opacity == (_CONSISTENT_OPACITY if 2 in others else _SINGLE_VIEW_OPACITY)).all()
 
 
-FINE = LiftConfig(surface_height=32)  # 32, 64 and 128 rows of points for a panorama of 128
-
-
-@pytest.fixture(scope="module")
-def detailed() -> tuple[PosedImages, list[Surface]]:
-    """Two cameras in a sphere; noise to the north, one colour elsewhere."""
+@pytest.fixture
+def detailed(monkeypatch) -> tuple[PosedImages, list[Surface]]:
+    """Two cameras in a sphere; noise to the north, one colour elsewhere. Points have 32, 64 and 128 rows."""
+    monkeypatch.setattr(module, "_SURFACE_HEIGHT", 32)
     image = np.full((128, 256, 3), 0.5, np.float32)
     noise = np.random.default_rng(0).random((20, 30, 3), np.float32)
     image[40:80, 100:160] = noise.repeat(2, axis=0).repeat(2, axis=1)
@@ -194,13 +201,14 @@ def _density(gaussians: Gaussians, *, detail: bool) -> float:
 
 
 def test_finer_lattices_replace_coarser_ones_where_a_large_panorama_has_detail(detailed):
-    gaussians = lift(*detailed, FINE)
+    gaussians = lift(*detailed)
     assert _density(gaussians, detail=True) == pytest.approx(1, abs=0.05)
     assert _density(gaussians, detail=False) < 0.12
     assert gaussians.levels.unique().tolist() == list(range(NUM_LEVELS))
 
 
-def test_the_limit_of_fine_points_holds(detailed):
-    unlimited, limited = lift(*detailed, FINE), lift(*detailed, dataclasses.replace(FINE, fine_points=400))
-    coarse = len(lift(detailed[0].resize(32), detailed[1], FINE))
+def test_the_limit_of_fine_points_holds(detailed, monkeypatch):
+    unlimited, coarse = lift(*detailed), len(lift(detailed[0].resize(32), detailed[1]))
+    monkeypatch.setattr(module, "_FINE_POINTS", 400)
+    limited = lift(*detailed)
     assert len(limited) < coarse + 2 * 400 < len(unlimited)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pansplat.sweep.matching import (
-    AggregationConfig,
     HypothesisSet,
     MatchingConfig,
     OtherView,
@@ -177,7 +176,6 @@ def test_spheres_seen_from_opposite_directions_are_penalised_and_planes_are_not(
 
 _AWAY_FROM_POLES = slice(8, -8)
 """Rows where the start of a path has no effect after half a turn; near a pole penalties are too high for that."""
-_DEFAULT = AggregationConfig()
 
 
 def _slots(height: int, sets: int = 1) -> np.ndarray:
@@ -195,9 +193,9 @@ def _noise(height: int, labels: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((height, 2 * height, labels)).astype(np.float32)
 
 
-def _aggregate(cost: np.ndarray, guide: np.ndarray | None = None, *, sets: int = 1, config=_DEFAULT) -> np.ndarray:
+def _aggregate(cost: np.ndarray, guide: np.ndarray | None = None, *, sets: int = 1) -> np.ndarray:
     height = len(cost)
-    return aggregate_costs(cost, _gray(height) if guide is None else guide, _slots(height, sets), 12, config)
+    return aggregate_costs(cost, _gray(height) if guide is None else guide, _slots(height, sets), 12)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +257,7 @@ def test_a_change_of_set_is_cheap_only_at_equal_depth():
     for start in (0.5, 6.5):  # hypothesis 4 of set 1 lies in slot 4, or in slot 10
         slot_map = _slots(height, 2)
         slot_map[..., 1, 1] = start
-        total = aggregate_costs(cost, _gray(height), slot_map, 20, AggregationConfig())
+        total = aggregate_costs(cost, _gray(height), slot_map, 20)
         least.append(float(total[16, 32, count + 4]))
     assert 0 < least[0] < 0.5 * least[1]
 

@@ -14,8 +14,7 @@ from pansplat.errors import InputError
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.gaussians.scene import Gaussians
 from pansplat.inputs.pairs import Pair
-from pansplat.sweep import Sweep, SweepConfig
-from pansplat.sweep.lift import LiftConfig
+from pansplat.sweep import Sweep
 from pansplat.sweep.search import SearchConfig
 from pansplat.system.progress import show_progress
 
@@ -177,21 +176,8 @@ def test_moving_the_world_moves_the_gaussians(make_room):
 
 
 def test_the_fingerprint_depends_on_the_settings():
-    assert Sweep().fingerprint == Sweep(SweepConfig()).fingerprint
-    others = [
-        SweepConfig(lift=LiftConfig(footprint=0.71)),
-        SweepConfig(search=SearchConfig(max_candidates=128)),
-        SweepConfig(search=dataclasses.replace(SearchConfig(), matching=dataclasses.replace(
-            SearchConfig().matching, window=3))),
-    ]  # fmt: skip
-    assert len({Sweep().fingerprint, *(Sweep(config).fingerprint for config in others)}) == 4
+    assert Sweep().fingerprint == Sweep(SearchConfig()).fingerprint != Sweep(SearchConfig(256)).fingerprint
     assert Sweep().name == "sweep" and Sweep().fingerprint.startswith("sweep-")
-
-
-def test_the_settings_change_the_prediction(small, predicted):
-    smaller = Sweep(SweepConfig(lift=LiftConfig(footprint=0.35)))(*small, 0.5, 8.0)
-    ratio = predicted.scales[:, 1].median() / smaller.scales[:, 1].median()
-    assert float(ratio) == pytest.approx(2.0, rel=0.05)
 
 
 def _decibels(pair: Pair, height: int) -> tuple[float, float]:

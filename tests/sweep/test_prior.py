@@ -3,8 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, View
-from pansplat.sweep.prior import DepthPrior, PriorConfig, PriorEstimator, apply_prior_cost
+from pansplat.sweep import prior as prior_module
+from pansplat.sweep import search as search_module
+from pansplat.sweep.matching import HypothesisSet, View
+from pansplat.sweep.prior import DepthPrior, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import ray_grid, resize_sphere, upright_rotation
 
@@ -69,9 +71,9 @@ def _estimate(room, poses, model_type=TrueDepth):
         turn = upright_rotation(pose[:3, :3], _DOWN)
         pose[:3, :3] = pose[:3, :3] if turn is None else pose[:3, :3] @ turn
     model = model_type(room, upright)
-    estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, _LIMITS, PriorConfig())
+    estimator = PriorEstimator(model, images, np.stack(poses), _DOWN, _LIMITS)
     others = [[other for other in range(len(views)) if other != view] for view in range(len(views))]
-    priors = estimator.estimate_by_matching(views, others, MatchingConfig())
+    priors = estimator.estimate_by_matching(views, others)
     assert {len(own) for own in priors} == {len(model.starts)}
     return model, priors, estimator
 
@@ -97,7 +99,7 @@ def test_neighbours_are_the_views_that_see_the_same_surfaces_best_first(make_roo
     room = make_room()
     poses = [room.pose((x, 0.0, 0.0)) for x in (0.0, 1.0, 0.4, 9.0)]
     estimator = PriorEstimator(
-        Spheres(room, poses), [np.ones((64, 128, 3), np.float32)] * 4, np.stack(poses), _DOWN, _LIMITS, PriorConfig()
+        Spheres(room, poses), [np.ones((64, 128, 3), np.float32)] * 4, np.stack(poses), _DOWN, _LIMITS
     )
     *near, far = estimator.choose_neighbours(3)
     assert near == [[2, 1], [2, 0], [0, 1]] and len(far) == 1
@@ -138,7 +140,7 @@ def test_tilted_cameras_are_turned_upright(make_room, turn):
 
 @pytest.mark.parametrize("cap", (0.5, 3.0))
 @pytest.mark.parametrize("count_priors", (1, 3))
-def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors):
+def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors, monkeypatch):
     generator = np.random.default_rng(0)
     shape, count = (4, 8), 5
     base = generator.uniform(0.2, 0.4, shape).astype(np.float32)
@@ -146,9 +148,10 @@ def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap,
     priors = [
         DepthPrior(generator.uniform(0, 1, shape), generator.uniform(0.01, 0.5, shape)) for _ in range(count_priors)
     ]
-    config = PriorConfig(weight=0.7, cap=cap, min_scale=0.1, further_penalty=0.4)
+    for name, value in {"_WEIGHT": 0.7, "_CAP": cap, "_MIN_SCALE": 0.1, "_FURTHER_PENALTY": 0.4}.items():
+        monkeypatch.setattr(prior_module, name, value)
     cost = np.ones((*shape, count), np.float32)
-    apply_prior_cost(cost, priors, [hypotheses], config)
+    apply_prior_cost(cost, priors, [hypotheses])
     log_inverse = np.log(base[..., None] + 0.1 * np.arange(count))
     away = [
         np.abs(log_inverse + prior.log_depth[..., None]) / np.maximum(prior.scale, 0.1)[..., None] + (0.4 if n else 0)
@@ -195,8 +198,8 @@ def _search_near(room, model_type):
     model = model_type(room, list(observed.posed.cam2world))
     surfaces = search(observe(observed.posed, SearchConfig(near_single_views=True), model))
     errors = [np.abs(np.log(s.inverse_depth * depth)) for s, depth in zip(surfaces, observed.depths, strict=True)]
-    steps = SearchConfig.single_view_candidates[-1] - 1
-    return [np.median(error) for error in errors], 2 * SearchConfig.single_view_reach[-1] / steps
+    steps = search_module._SINGLE_VIEW_CANDIDATES[-1] - 1
+    return [np.median(error) for error in errors], 2 * search_module._SINGLE_VIEW_REACH[-1] / steps
 
 
 def test_search_near_single_views_removes_their_smooth_errors(make_room):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pansplat.sweep import search as module
 from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages
 
@@ -42,17 +43,17 @@ def test_a_box_is_in_front_of_the_walls(furnished_room, empty_room, view):
 
 def test_surfaces_stay_within_the_depth_range(small_furnished_room):
     inverse = _search(small_furnished_room.posed, near=2.0, far=2.5)  # too narrow for the room
-    near, far = 2.0 * SearchConfig().near_margin, 2.5 * SearchConfig().far_margin
+    near, far = 2.0 * module._NEAR_MARGIN, 2.5 * module._FAR_MARGIN
     assert inverse.min() >= np.float32(1 / far) and inverse.max() <= np.float32(1 / near)
 
 
-def test_walls_beyond_far_are_found(empty_room):
+def test_walls_beyond_far_are_found(empty_room, monkeypatch):
     beyond = empty_room.depths > 2.0
     assert beyond.mean() > 0.3
     medians = []
     for far_margin in (1.0, 10.0):
-        posed, config = dataclasses.replace(empty_room.posed, far=1.8), SearchConfig(far_margin=far_margin)
-        found = np.stack([s.inverse_depth for s in search(observe(posed, config))])
+        monkeypatch.setattr(module, "_FAR_MARGIN", far_margin)
+        found = _search(empty_room.posed, far=1.8)
         error = np.abs(1 / (found * empty_room.depths) - 1)
         medians.append(np.median(error[beyond]))
         assert np.median(error[~beyond]) < 0.03

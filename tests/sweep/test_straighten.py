@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.straighten import StraightenConfig, straighten
+from pansplat.sweep.straighten import straighten
 from pansplat.sweep.surface import rotate_image
 
 _HEIGHT = 128
@@ -32,7 +32,7 @@ def _wave() -> np.ndarray:
 
 def test_waves_beside_a_vertical_edge_are_smoothed_and_all_else_stays():
     wavy = _wall() + _wave()
-    found = straighten(wavy, _photograph(), _DOWN, StraightenConfig())
+    found = straighten(wavy, _photograph(), _DOWN)
     assert np.abs(found - _wall())[_BESIDE].max() < 0.2 * np.abs(_wave()).max()
     away = np.ones(wavy.shape, bool)
     away[:, 94:110] = False
@@ -41,7 +41,7 @@ def test_waves_beside_a_vertical_edge_are_smoothed_and_all_else_stays():
 
 def test_jumps_of_depth_along_an_edge_stay():
     near_below = np.where(_LATITUDE > 0, _wall(1.0), _wall(2.0))
-    found = straighten(near_below, _photograph(), _DOWN, StraightenConfig())
+    found = straighten(near_below, _photograph(), _DOWN)
     np.testing.assert_allclose(found, near_below, atol=0.01)
 
 
@@ -50,7 +50,7 @@ def test_lines_on_a_floor_change_no_depth():
     down = np.maximum(np.sin(_LATITUDE), 1e-3)
     floor = np.log(np.minimum(1.5 / down, 8.0)) * np.ones((1, 2 * _HEIGHT))
     rows = slice(84, 120)  # of the floor
-    found = straighten(floor, _photograph(rows), _DOWN, StraightenConfig())
+    found = straighten(floor, _photograph(rows), _DOWN)
     np.testing.assert_allclose(found[rows], floor[rows], atol=0.02)
 
 
@@ -60,6 +60,6 @@ def test_a_tilted_camera_has_the_same_edges(turn, degrees):
     tilt = turn("x", degrees) @ turn("z", degrees / 2)
     wavy = _wall() + _wave()
     tilted = rotate_image(np.concatenate((wavy[..., None], _photograph()), axis=-1), tilt)
-    found = straighten(tilted[..., 0], tilted[..., 1:].astype(np.float32), tilt.T @ _DOWN, StraightenConfig())
+    found = straighten(tilted[..., 0], tilted[..., 1:].astype(np.float32), tilt.T @ _DOWN)
     back = rotate_image(found[..., None], tilt.T)[..., 0]
     assert np.median(np.abs(back - _wall())[_BESIDE]) < 0.3 * np.median(np.abs(_wave()))

@@ -14,10 +14,12 @@ from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt32
 
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.rendering.cpu.display import (
@@ -30,13 +32,11 @@ from pansplat.rendering.cpu.display import (
     SelectionCache,
     blend_layers,
     blend_to_pixels,
-    enlarge,
 )
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions
 from pansplat.system.devices import say_place
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
@@ -305,17 +305,17 @@ class CpuRenderer:
         self, frame: Frame, groups: _Groups, plane: ImagePlane, cache: SelectionCache | None = None
     ) -> Layers:
         """Rasterise the Gaussians in view of a plane; a panorama has a ray for each pixel."""
-        options, selection = RasterOptions(near=frame.settings.near), None
+        selection = None
         if not plane.is_panorama:
             camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
-            deviation = math.sqrt(options.filter_variance(plane.pixel_angle))
+            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle
             selection = Selection(camera.compute_side_normals(), deviation)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
             groups.labels,
             len(groups.weights),
-            options,
+            frame.settings.near,
             selection=selection,
             cache=cache,
             min_transmittance=self._min_transmittance,
@@ -496,7 +496,7 @@ def _enlarge(
     """The pixels at the full size of the frame: OpenGL in software takes ten times as long to enlarge a texture."""
     if frame.size == frame.full_size:
         return pixels
-    start, large = time.perf_counter(), pooled_empty(frame.full_size[::-1], np.uint32)
-    enlarge(pixels, large)
+    start, large = time.perf_counter(), pooled_empty((*frame.full_size[::-1], 4), np.uint8)
+    cv2.resize(pixels.view(np.uint8).reshape(*pixels.shape, 4), frame.full_size, large)
     stages["enlarge"] = 1e3 * (time.perf_counter() - start)
-    return large
+    return large.view(np.uint32)[..., 0]

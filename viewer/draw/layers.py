@@ -192,7 +192,7 @@ class LayerPainter:
 
 def compute_filter_variance(focal: float) -> float:
     """Variance of the low-pass filter (docs/rendering.md, section 2), in image-plane units squared."""
-    return FILTER_VARIANCE["angular"] / (focal * focal)
+    return FILTER_VARIANCE / (focal * focal)
 
 
 class SplatRasterizer:

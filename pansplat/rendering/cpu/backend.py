@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pansplat.constants import MAX_MAGNITUDE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
@@ -32,7 +31,7 @@ from pansplat.rendering.cpu.tiling import (
 )
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
+from pansplat.rendering.rasterize import RasterOptions
 
 
 class _PlaneState(NamedTuple):
@@ -48,12 +47,13 @@ def rasterize_planes(
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
-) -> RasterSums:
-    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`.
-
-    The kernels have three channels: other numbers are rasterised in groups of three.
-    """
-    require_exact_kernel(options)
+) -> Float[Tensor, "plane sums height width"]:
+    """Rasterise by numba kernels, in float32; see `pansplat.rendering.rasterize.RasterBackend`."""
+    if options.kernel != "ray" or gaussians.harmonics.shape[2] != 3:
+        raise InputError(
+            f"backend 'numba' has kernel 'ray' and three channels only, got kernel {options.kernel!r} and "
+            f"{gaussians.harmonics.shape[2]} channels; use backend='torch'"
+        )
     if gaussians.means.device.type != "cpu":
         raise InputError(
             f"backend 'numba' needs Gaussians in main memory, got them on {gaussians.means.device}; use "
@@ -64,38 +64,13 @@ def rasterize_planes(
             f"`size` must be at most {LARGEST_SIDE} pixels a side for backend 'numba', got {planes[0].size}; "
             "choose a smaller size, or use backend='torch'"
         )
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    tensors = tuple(tensor.to(torch.float32).contiguous() for tensor in tensors)
-    harmonics = gaussians.harmonics.to(torch.float32)
-    has_grad = any(tensor.requires_grad for tensor in (*tensors, harmonics, pose)) and torch.is_grad_enabled()
-    by_depth = options.order == "z" and not planes[0].is_panorama
-    if by_depth or (planes[0].eye_offset and has_grad):  # too rare for kernels of their own
+    fields = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics
+    tensors = tuple(field.to(torch.float32).contiguous() for field in fields)
+    has_grad = any(tensor.requires_grad for tensor in (*tensors, pose)) and torch.is_grad_enabled()
+    if planes[0].eye_offset and has_grad:  # too rare for kernels of its own
         return reference.rasterize_planes(gaussians, pose, planes, options)
-    groups = [harmonics.contiguous()] if harmonics.shape[2] == 3 else _split_channels(harmonics)
-    parts = []
-    for group in groups:
-        statistics = Statistics()
-        parts.append(_Rasterize.apply(pose, planes, options, statistics, torch.is_grad_enabled(), *tensors, group))
-    sums = parts[0]
-    if harmonics.shape[2] != 3:
-        colors = torch.cat([part[:, :3] for part in parts], dim=1)[:, : harmonics.shape[2]]
-        sums = torch.cat((colors, parts[0][:, 3:]), dim=1)
-    info = RasterInfo(total=len(gaussians), backend="numba", **vars(statistics))
-    return RasterSums(sums.to(gaussians.means.dtype), info)
-
-
-def _split_channels(harmonics: Float[Tensor, "n k channel"]) -> list[Float[Tensor, "n k 3"]]:
-    """The channels in groups of three, the last one with zeros; a Gaussian that is unusable in one is so in all."""
-    usable = (harmonics.abs() <= MAX_MAGNITUDE).all(dim=2).all(dim=1)
-    padded = torch.nn.functional.pad(harmonics, (0, -harmonics.shape[2] % 3 if harmonics.shape[2] else 3))
-    padded = torch.where(usable[:, None, None], padded, torch.nan)
-    return [group.contiguous() for group in padded.split(3, dim=2)]
-
-
-def require_exact_kernel(options: RasterOptions) -> None:
-    """Raise an InputError for a kernel other than the exact one."""
-    if options.kernel != "ray":
-        raise InputError(f"backend 'numba' has kernel 'ray' only, got kernel {options.kernel!r}; use backend='torch'")
+    sums = _Rasterize.apply(pose, planes, options.near, torch.is_grad_enabled(), *tensors)
+    return sums.to(gaussians.means.dtype)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -106,30 +81,26 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,
         pose: Tensor,
         planes: list[ImagePlane],
-        options: RasterOptions,
-        statistics: Statistics,
+        near: float,
         grad_enabled: bool,
         *tensors: Tensor,
     ) -> Tensor:
         """Sums; `tensors` are the fields of GaussianArrays."""
-        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
+        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
         with announce_compilation():
-            with statistics.timed("project"):
-                projected = project_gaussians(gaussians, camera, workspace, threads)
-            view = CameraView(gaussians, camera, projected, options, threads)
+            projected = project_gaussians(gaussians, camera, workspace, threads)
+            view = CameraView(gaussians, camera, projected, threads)
             sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
             states = [
-                rasterize_plane(view, plane, plane_sums, statistics, workspace if needs_grad else None)
+                rasterize_plane(view, plane, plane_sums, Statistics(), workspace if needs_grad else None)
                 for plane, plane_sums in zip(planes, sums, strict=True)
             ]
-        statistics.dropped, statistics.near = projected.dropped, projected.near
-        statistics.bytes += sums.nbytes + sum(array.nbytes for array in projected[:4])
         result = torch.from_numpy(sums)
         if needs_grad:  # the workspace is kept because it owns the arrays of `projected` and `states`
             ctx.save_for_backward(*tensors, pose, result)
-            ctx.saved = planes, options, projected, states, workspace, threads
+            ctx.saved = planes, near, projected, states, workspace, threads
         return result
 
     @staticmethod
@@ -137,10 +108,10 @@ class _Rasterize(torch.autograd.Function):
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
-        planes, options, projected, states, _workspace, threads = ctx.saved
-        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], options)
-        view = CameraView(gaussians, camera, projected, options, threads)
-        needs_pose, _, _, _, _, *needed = ctx.needs_input_grad
+        planes, near, projected, states, _workspace, threads = ctx.saved
+        gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
+        view = CameraView(gaussians, camera, projected, threads)
+        needs_pose, _, _, _, *needed = ctx.needs_input_grad
         grads = [
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None
             for tensor, is_needed in zip(tensors, needed, strict=True)
@@ -159,7 +130,7 @@ class _Rasterize(torch.autograd.Function):
         if needs_pose:
             grad_pose = torch.zeros_like(pose)
             grad_pose[:3] = torch.from_numpy(gradients.pose)
-        return (grad_pose, None, None, None, None, *grads)
+        return (grad_pose, None, None, None, *grads)
 
 
 def rasterize_plane(
@@ -175,7 +146,7 @@ def rasterize_plane(
     """
     projected, threads, needs_grad = view.projected, view.threads, saved_in is not None
     if plane.eye_offset:
-        rasterize_columns(view, plane, sums, statistics)
+        rasterize_columns(view, plane, sums)
         return None
     workspace = saved_in or Workspace()
     with statistics.timed("bound"):
@@ -193,12 +164,9 @@ def rasterize_plane(
         saved = allocate_saved(tiles.starts, tiles.workspace) if needs_grad and is_whole_image else None
         with statistics.timed("rasterize"):
             _rasterize_band(view, tiles, tables, sums, saved)
-        statistics.intersections += len(tiles.intersections)
-        arrays = [boxes, tiles.intersections, tiles.starts, tiles.slots, tiles.offsets, *(saved or ())]
-        statistics.bytes = max(statistics.bytes, sum(array.nbytes for array in arrays))
         if saved is not None:
             state = state._replace(tiles=tiles, saved=saved)
-        del tiles, arrays  # the next band reuses their memory
+        del tiles  # the next band reuses their memory
     statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != tiling.EMPTY_BOX))
     return state if needs_grad else None
 

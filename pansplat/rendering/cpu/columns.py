@@ -20,7 +20,6 @@ from pansplat.rendering.cpu.projection import (
     GAUSSIANS_PER_ITEM,
     Camera,
     GaussianArrays,
-    ProjectedGaussians,
     project_gaussians,
 )
 from pansplat.rendering.cpu.rasterize import rasterize_forward
@@ -34,7 +33,7 @@ from pansplat.rendering.cpu.tiling import (
     intersect_tiles,
     sort_front_to_back,
 )
-from pansplat.rendering.cpu.view import CameraView, Statistics
+from pansplat.rendering.cpu.view import CameraView
 from pansplat.rendering.image_planes import ImagePlane
 
 _MAX_PAIRS = 1 << 19  # in a strip of columns, unless one tile's width has more: 60 MB of records and values
@@ -57,60 +56,39 @@ class _Pairs(NamedTuple):
     columns: Int[np.ndarray, "pair"]
 
 
-def rasterize_columns(
-    view: CameraView, plane: ImagePlane, sums: Float[np.ndarray, "sums height width"], statistics: Statistics
-) -> None:
+def rasterize_columns(view: CameraView, plane: ImagePlane, sums: Float[np.ndarray, "sums height width"]) -> None:
     """Write the sums of a panorama whose columns have their own eyes.
 
     Args:
         view: the projection is that of the centre of the viewing circle.
         plane: a direct panorama with an eye offset; its rotation is the identity.
         sums: written.
-        statistics: counts and times are added.
     """
     threads, width = view.threads, plane.size[1]
     eyes = plane.column_eyes().numpy()
     workspace = Workspace()
-    with statistics.timed("bound"):
-        ranges = _find_columns(view, plane, workspace)
+    ranges = _find_columns(view, plane, workspace)
     for low, high in _split_columns(ranges, width):
         strip = Workspace()
-        with statistics.timed("select"):
-            pairs = _list_pairs(ranges, low, high, width, strip, threads)
-            gaussians = _gather(view.gaussians, view.camera, eyes, pairs, strip, threads)
-            pose = view.camera.pose.copy()
-            pose[:3, 3] = 0
-        with statistics.timed("project"):
-            projected = project_gaussians(gaussians, view.camera._replace(pose=pose), strip, threads)
-        with statistics.timed("bound"):
-            boxes = find_bounding_boxes(projected.records, plane, strip, threads)
-            cut = partial(_cut_to_columns, boxes.view(np.int64)[:, 0], pairs.columns, low)
-            parallel_for(cut, -(-len(boxes) // GAUSSIANS_PER_ITEM), threads)
+        pairs = _list_pairs(ranges, low, high, width, strip, threads)
+        gaussians = _gather(view.gaussians, view.camera, eyes, pairs, strip, threads)
+        pose = view.camera.pose.copy()
+        pose[:3, 3] = 0
+        projected = project_gaussians(gaussians, view.camera._replace(pose=pose), strip, threads)
+        boxes = find_bounding_boxes(projected.records, plane, strip, threads)
+        cut = partial(_cut_to_columns, boxes.view(np.int64)[:, 0], pairs.columns, low)
+        parallel_for(cut, -(-len(boxes) // GAUSSIANS_PER_ITEM), threads)
         tables = tabulate_columns(plane, low, high)
         size = len(tables.rows), len(tables.columns)
         folded = pooled_empty((len(sums), *size), np.float32)
-        bands = intersect_tiles(boxes, size, slots=False, threads=threads, limit=MAX_INTERSECTIONS)
-        while True:
-            with statistics.timed("intersect"):
-                tiles = next(bands, None)
-            if tiles is None:
-                break
-            with statistics.timed("sort"):
-                sort_front_to_back(tiles, projected.radii, threads)
-            with statistics.timed("rasterize"):
-                rasterize_forward(
-                    projected.records, projected.values, tiles.intersections, tiles.starts, tables, folded,
-                    first_row=tiles.first_row, threads=threads, min_transmittance=view.min_transmittance,
-                )  # fmt: skip
-            statistics.intersections += len(tiles.intersections)
+        for tiles in intersect_tiles(boxes, size, slots=False, threads=threads, limit=MAX_INTERSECTIONS):
+            sort_front_to_back(tiles, projected.radii, threads)
+            rasterize_forward(
+                projected.records, projected.values, tiles.intersections, tiles.starts, tables, folded,
+                first_row=tiles.first_row, threads=threads, min_transmittance=view.min_transmittance,
+            )  # fmt: skip
         unfolded = folded.reshape(len(sums), size[0], high - low, BLOCK_WIDTH).transpose(0, 1, 3, 2)
         sums[:, :, low:high] = unfolded.reshape(len(sums), -1, high - low)[:, : plane.size[0]]
-        statistics.visible += int(np.count_nonzero(boxes.view(np.int64) != EMPTY_BOX))
-        statistics.bytes = max(statistics.bytes, _count_bytes(gaussians, projected))
-
-
-def _count_bytes(gaussians: GaussianArrays, projected: ProjectedGaussians) -> int:
-    return sum(array.nbytes for array in (*gaussians, *projected[:4]))
 
 
 def _find_columns(view: CameraView, plane: ImagePlane, workspace: Workspace) -> _ColumnRanges:

@@ -18,7 +18,8 @@ import torch
 from jaxtyping import Float, Int, UInt32
 
 from pansplat.geometry.cubemap import face_rotations
-from pansplat.rendering.cpu.backend import rasterize_plane, require_exact_kernel
+from pansplat.rendering.blend import blend
+from pansplat.rendering.cpu.backend import rasterize_plane
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
 from pansplat.rendering.cpu.runtime import (
     Workspace,
@@ -33,7 +34,7 @@ from pansplat.rendering.cpu.runtime import (
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions
+from pansplat.rendering.rasterize import normalise_sums
 
 MIN_TRANSMITTANCE = 2.0**-10
 """A pixel of a display image is finished at this transmittance: a quarter of a step of 8 bits."""
@@ -186,7 +187,7 @@ class DisplayScene:
         plane: ImagePlane,
         labels: Int[np.ndarray, "n"],
         num_layers: int,
-        options: RasterOptions,
+        near: float,
         *,
         selection: Selection | None = None,
         cache: SelectionCache | None = None,
@@ -199,18 +200,17 @@ class DisplayScene:
             plane: its rotation is from its axes to the world's; a direct panorama has its axes in the world's.
             labels: layer of each Gaussian, int16, or `NO_LAYER`.
             num_layers: number of layers.
-            options: of the image; with the exact kernel.
+            near: Gaussians whose mean is nearer are not drawn, metres.
             selection: leaves out Gaussians that are not in view.
             cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
         """
-        require_exact_kernel(options)
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
         if plane.is_panorama:  # its pixels have fixed directions in the records' axes
             pose[:3, :3], plane = plane.rotation, replace(plane, rotation=torch.eye(3, dtype=torch.float64))
-        camera = make_camera(pose, plane, options)
+        camera = make_camera(pose, plane, near)
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
         with announce_compilation():
             with statistics.timed("select"):
@@ -227,9 +227,9 @@ class DisplayScene:
             start = 0
             for end, layer_sums in zip(ends, sums, strict=True):
                 part = slice(start, end)
-                layer = ProjectedGaussians(*(array[part] for array in projected[:4]), 0, 0)
+                layer = ProjectedGaussians(*(array[part] for array in projected))
                 arrays = GaussianArrays(*(array[part] for array in gaussians))
-                view = CameraView(arrays, camera, layer, options, threads, min_transmittance)
+                view = CameraView(arrays, camera, layer, threads, min_transmittance)
                 rasterize_plane(view, plane, layer_sums, statistics)
                 start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)
@@ -377,19 +377,10 @@ def blend_layers(
 
     Source: docs/rendering.md, section 7, with positive weights.
     """
-    alphas = np.minimum(sums[:, 4], 1)
-    mix = np.asarray(weights, np.float32)[:, None, None] * alphas
-    total = mix.sum(axis=0)
-    scale = np.divide(1, total, out=np.zeros_like(total), where=total > 0)
-    alpha = alphas.max(axis=0)
-    with np.errstate(invalid="ignore"):
-        depths = np.where(sums[:, 4] > 0, sums[:, 3] / np.where(sums[:, 4] > 0, sums[:, 4], 1), 0)
-    color = np.empty((*alpha.shape, 4), np.float32)
-    for channel in range(3):
-        mixed = np.tensordot(np.asarray(weights, np.float32), sums[:, channel], axes=1)
-        color[..., channel] = mixed * scale * alpha + (1 - alpha) * background[channel]
-    color[..., 3] = alpha
-    return color, (mix * depths).sum(axis=0) * scale
+    behind = torch.tensor(background, dtype=torch.float32)
+    layers = [normalise_sums(torch.from_numpy(layer), behind) for layer in sums]
+    image = blend(layers, torch.as_tensor(weights, dtype=torch.float32))
+    return torch.cat((image.color, image.alpha[None])).movedim(0, 2).contiguous().numpy(), image.depth.numpy()
 
 
 def blend_to_pixels(
@@ -455,34 +446,6 @@ def _blend_row(sums, weights, background, y, rgb, total, coverage):
         rgb[0, x] = rgb[0, x] * scale + behind * background[0]
         rgb[1, x] = rgb[1, x] * scale + behind * background[1]
         rgb[2, x] = rgb[2, x] * scale + behind * background[2]
-
-
-def enlarge(image: UInt32[np.ndarray, "height width"], pixels: UInt32[np.ndarray, "large_height large_width"]) -> None:
-    """Write an image at a larger size, by bilinear interpolation between the centres of its pixels."""
-    places = []
-    for small, large in zip(image.shape, pixels.shape, strict=True):
-        place = np.clip((np.arange(large) + 0.5) * (small / large) - 0.5, 0, small - 1)
-        places.append((place * (1 << _FRACTION_BITS)).astype(np.int32))
-    work = partial(_enlarge_rows, image, *places, pixels)
-    with announce_compilation():
-        parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
-
-
-@kernel
-def _enlarge_rows(image, rows, columns, pixels, item):
-    height, width = image.shape
-    mixed = np.empty(width + 1, np.uint32)
-    for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, len(rows))):
-        upper, fraction = rows[y] >> _FRACTION_BITS, np.uint32(rows[y] & 255)
-        lower = min(upper + 1, height - 1)
-        for x in range(width):
-            mixed[x] = _mix(image[upper, x], image[lower, x], fraction)
-        mixed[width] = mixed[width - 1]
-        row = pixels[y]
-        for x in range(len(columns)):
-            place = load_scalar(columns, x)
-            left, right = place >> _FRACTION_BITS, np.uint32(place & 255)
-            store_scalar(row, x, _mix(load_scalar(mixed, left), load_scalar(mixed, left + 1), right))
 
 
 # --- a rotated view from cube faces ---

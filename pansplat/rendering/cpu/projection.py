@@ -35,8 +35,6 @@ from pansplat.rendering.cpu.simd import (
     broadcast,
     load_row,
     mantissa_and_exponent,
-    mask_bits,
-    popcount,
     prefetch,
     select,
     soa_to_records,
@@ -53,7 +51,6 @@ GAUSSIANS_PER_ITEM = 8192
 CULLED = -128.0  # log2_peak of a culled Gaussian
 
 _MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # without the sign
-_DROPPED, _NEAR = 0, 1  # columns of the counts
 
 # Rows of a block: inputs and results.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 10  # the shape is a quaternion and three scales
@@ -95,13 +92,11 @@ class Camera(NamedTuple):
     Attributes:
         pose: cam2world, (4, 4) float64.
         filter_variance: e^2, added across the ray, radians^2; above 0.
-        compensate: whether the filter lowers the opacity by the factor by which it widens the Gaussian.
         near: metres.
     """
 
     pose: np.ndarray
     filter_variance: float
-    compensate: bool
     near: float
 
 
@@ -112,16 +107,12 @@ class ProjectedGaussians(NamedTuple):
         records, values: see records.py; `log2_peak` is `CULLED` if a Gaussian is culled.
         radii: (n,) float64, metres.
         kept: (n,) uint8, 0 for culled Gaussians.
-        dropped: number of Gaussians with an unusable number.
-        near: number of Gaussians that are too near.
     """
 
     records: np.ndarray
     values: np.ndarray
     radii: np.ndarray
     kept: np.ndarray
-    dropped: int
-    near: int
 
 
 def project_gaussians(
@@ -131,27 +122,24 @@ def project_gaussians(
     num = len(gaussians.means)
     records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
     values, kept = workspace.array((num, 4), np.float32), workspace.array(num, np.uint8)
-    num_items = -(-num // GAUSSIANS_PER_ITEM)
-    counts = np.zeros((num_items, 2), np.int64)
     harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
     work = partial(
         _project_gaussians, *gaussians, harmonic_bits, *camera, gaussians.view_dependent,
-        records.reshape(-1), values, radii, kept, counts,
+        records.reshape(-1), values, radii, kept,
     )  # fmt: skip
-    parallel_for(work, num_items, threads)
-    dropped, near = (int(count) for count in counts.sum(axis=0))
-    return ProjectedGaussians(records, values, radii, kept, dropped, near)
+    parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
+    return ProjectedGaussians(records, values, radii, kept)
 
 
 @kernel
 def _project_gaussians(
     means, quats, scales, opacities, harmonics, harmonic_bits,
-    pose, filter_variance, compensate, near, view_dependent, records, values, radii, kept, counts, item,
+    pose, filter_variance, near, view_dependent, records, values, radii, kept, item,
 ):  # fmt: skip
     align_stack()
     rows, block_kept = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
     basis, soa = np.empty((25, GAUSSIAN_BLOCK), np.float32), np.empty(layout.RECORD_SIZE * LANES, np.float32)
-    num_dropped, num_near, camera = 0, 0, pose_columns(pose)
+    camera = pose_columns(pose)
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
         may_be_invalid = load_block(means, quats, scales, opacities, start, count, rows)
@@ -159,30 +147,23 @@ def _project_gaussians(
         if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):
-            state, is_kept = _compute_records(camera, filter_variance, compensate, near, rows, i, soa)
-            lanes_used = min(LANES, count - i)
-            used = np.uint64((1 << lanes_used) - 1)
-            num_dropped += popcount(mask_bits(state == 0.0) & used)
-            num_near += popcount(mask_bits(state < 0.0) & used)
-            store_mask(block_kept, i, is_kept)
-            soa_to_records(soa, LANES, start + i, lanes_used, records)
+            store_mask(block_kept, i, _compute_records(camera, filter_variance, near, rows, i, soa))
+            soa_to_records(soa, LANES, start + i, min(LANES, count - i), records)
         for i in range(count):
             store_scalar(radii, start + i, rows[RADIUS_ROW, i])
         for i in range(count):
             store_scalar(kept, start + i, block_kept[i])
         evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
         evaluate_colors(harmonics, start, count, basis, view_dependent, rows, RADIUS_ROW, values)
-    counts[item, _DROPPED], counts[item, _NEAR] = num_dropped, num_near
 
 
 @inline_kernel
-def _compute_records(pose, filter_variance, compensate, near, rows, i, soa):
-    """Write the records of eight Gaussians, a row of `soa` per field; return their states and which are kept."""
+def _compute_records(pose, filter_variance, near, rows, i, soa):
+    """Write the records of eight Gaussians, a row of `soa` per field; return which are kept."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
-    n, radius, inverse, state = compute_direction(rows, i, pose, near)
+    n, radius, inverse = compute_direction(rows, i, pose)
     store_row(rows, RADIUS_ROW, i, radius)
-    u, v, cov, state = compute_tangent_covariance(rows, i, n, inverse, state)
-    state = state * load_row(rows, VALID_ROW, i)
+    u, v, cov, usable = compute_tangent_covariance(rows, i, n, inverse)
     factors, l_along_a, l_along_b, radial_variance, _, inverse_det = compute_whitening(cov, filter_variance)
     a, b = whitened_axes(u, v, factors)
     store_vector(rows, DIRECTION_ROW, i, n)
@@ -196,13 +177,11 @@ def _compute_records(pose, filter_variance, compensate, near, rows, i, soa):
     store(soa, layout.L_ALONG_B * LANES, to_f32(inverse_unit * l_along_b))
     store(soa, layout.RADIAL_VARIANCE * LANES, to_f32((1 / layout.HALF_LOG2_E) * radial_variance))
     opacity = load_row(rows, OPACITY_ROW, i)
-    squared_peak = opacity * opacity
-    if compensate:
-        squared_peak = squared_peak * max(cov[6] * inverse_det, MIN_COMPENSATION)
-    kept = (state > 0) & (opacity >= OPACITY_CUT)
+    squared_peak = opacity * opacity * max(cov[6] * inverse_det, MIN_COMPENSATION)
+    kept = usable & (radius >= near) & (load_row(rows, VALID_ROW, i) > 0) & (opacity >= OPACITY_CUT)
     log2_peak = select(kept, 0.5 * _log2(select(kept, squared_peak, broadcast(1.0))), broadcast(CULLED))
     store(soa, layout.LOG2_PEAK * LANES, to_f32(log2_peak))
-    return state, kept
+    return kept
 
 
 @inline_kernel
@@ -299,29 +278,27 @@ def pose_columns(pose):
 
 
 @inline_kernel
-def compute_direction(rows, i, pose, near):
-    """Direction, distance, one over the distance, and a state: 1, or -1 if the Gaussian is too near."""
+def compute_direction(rows, i, pose):
+    """Direction, distance, and one over the distance."""
     mx, my, mz = load_vector(rows, MEAN_ROW, i)
     x, y, z = mx - pose[3][0], my - pose[3][1], mz - pose[3][2]
     radius = math.sqrt(x * x + y * y + z * z)
     inverse = 1 / radius
-    state = select(radius < near, broadcast(-1.0), broadcast(1.0))
-    return (x * inverse, y * inverse, z * inverse), radius, inverse, state
+    return (x * inverse, y * inverse, z * inverse), radius, inverse
 
 
 @inline_kernel
-def compute_tangent_covariance(rows, i, n, inverse, state):
-    """Tangent axes u and v, the covariance, and the state: 0 if the shape is unusable.
+def compute_tangent_covariance(rows, i, n, inverse):
+    """Tangent axes u and v, the covariance, and whether the shape is usable.
 
     Args:
         n: directions.
         inverse: one over the distance.
-        state: of `compute_direction`.
     """
     frame = tangent_frame(n[0], n[1], n[2])
     u, v = (frame[0], frame[1], frame[2]), (frame[3], frame[4], frame[5])
-    cov, state = _covariance_of_axes(rows, i, u, n, inverse, state)
-    return u, v, cov, state
+    cov, usable = _covariance_of_axes(rows, i, u, n, inverse)
+    return u, v, cov, usable
 
 
 @inline_kernel
@@ -347,14 +324,12 @@ def _rotation(w, x, y, z):
 
 
 @inline_kernel
-def _covariance_of_axes(rows, i, u, n, inverse, state):
+def _covariance_of_axes(rows, i, u, n, inverse):
     """The covariance of rotations and scales, as sums of squares, without cancellation."""
     s0, s1, s2 = load_vector(rows, SHAPE_ROW + 4, i)
     e0, e1, e2, _ = load_axes(rows, i)
     s0, s1, s2 = s0 * inverse, s1 * inverse, s2 * inverse
     s0, s1, s2 = s0 * s0, s1 * s1, s2 * s2
-    usable = max(max(s0, s1), s2) <= MAX_SCALE_RATIO * MAX_SCALE_RATIO
-    state = select(usable, state, select(state < 0, state, broadcast(0.0)))
     u0, u1, u2 = dot(*u, *e0), dot(*u, *e1), dot(*u, *e2)
     n0, n1, n2 = dot(*n, *e0), dot(*n, *e1), dot(*n, *e2)
     v0, v1, v2 = cross(n0, n1, n2, u0, u1, u2)
@@ -369,7 +344,7 @@ def _covariance_of_axes(rows, i, u, n, inverse, state):
         w0 * n0 * n0 + w1 * n1 * n1 + w2 * n2 * n2,
         w0 * (u0 * u0 + v0 * v0) + w1 * (u1 * u1 + v1 * v1) + w2 * (u2 * u2 + v2 * v2),
         s0 * w0,
-    ), state
+    ), max(max(s0, s1), s2) <= MAX_SCALE_RATIO * MAX_SCALE_RATIO
 
 
 @inline_kernel

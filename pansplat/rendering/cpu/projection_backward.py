@@ -142,7 +142,7 @@ def _accumulate_slots(offsets, slots, totals, item):
 
 @kernel
 def _backpropagate_projection(
-    means, quats, scales, opacities, harmonics, pose, filter_variance, compensate, near,
+    means, quats, scales, opacities, harmonics, pose, filter_variance, near,
     view_dependent, scene_kept, values, grad_records, grad_values, offsets,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_harmonics, pose_sums, item,
 ):  # fmt: skip
@@ -160,7 +160,7 @@ def _backpropagate_projection(
         records_to_soa(record_sums, 0, count, soa.reshape(-1), GAUSSIAN_BLOCK)
         _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
-            _backpropagate_records(camera, filter_variance, compensate, near, rows, soa.reshape(-1), grad_pose, i)
+            _backpropagate_records(camera, filter_variance, rows, soa.reshape(-1), grad_pose, i)
         if view_dependent is None:
             backpropagate_constant_colors(start, count, values, value_sums, grad_harmonics)
         else:
@@ -233,13 +233,11 @@ def _clear_culled(scene_kept, start, count, pose, rows, soa, kept):
 
 
 @inline_kernel
-def _backpropagate_records(pose, filter_variance, compensate, near, rows, soa, grad_pose, i):
+def _backpropagate_records(pose, filter_variance, rows, soa, grad_pose, i):
     """Write the gradients of shapes, opacities, directions and distances, given those of records."""
-    n, radius, inverse, state = compute_direction(rows, i, pose, near)
-    u, v, cov, _ = compute_tangent_covariance(rows, i, n, inverse, state)
-    g_n, parts, g_det = _backpropagate_footprint_rows(
-        pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose
-    )
+    n, radius, inverse = compute_direction(rows, i, pose)
+    u, v, cov, _ = compute_tangent_covariance(rows, i, n, inverse)
+    g_n, parts, g_det = _backpropagate_footprint_rows(pose, filter_variance, u, v, n, cov, soa, i, grad_pose)
     g_n, g_radius = _backpropagate_axes(rows, i, u, n, inverse, g_n, parts, g_det)
     store_row(rows, _RADIUS_GRAD_ROW, i, load_row(rows, _RADIUS_GRAD_ROW, i) + g_radius)
     g_log_peak = (1 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i)
@@ -250,7 +248,7 @@ def _backpropagate_records(pose, filter_variance, compensate, near, rows, soa, g
 
 
 @inline_kernel
-def _backpropagate_footprint_rows(pose, filter_variance, compensate, u, v, n, cov, soa, i, grad_pose):
+def _backpropagate_footprint_rows(pose, filter_variance, u, v, n, cov, soa, i, grad_pose):
     """The gradient of n, the parts of that of C for `_covariance_gradient`, and that of det B."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     factors, alpha, beta, radial_variance, det_filtered, _ = compute_whitening(cov, filter_variance)
@@ -264,11 +262,10 @@ def _backpropagate_footprint_rows(pose, filter_variance, compensate, u, v, n, co
     g_alpha = inverse_unit * _load_field(soa, layout.L_ALONG_A, i)
     g_beta = inverse_unit * _load_field(soa, layout.L_ALONG_B, i)
     g_radial = (1 / layout.HALF_LOG2_E) * _load_field(soa, layout.RADIAL_VARIANCE, i)
-    g_ln_ratio, g_det = broadcast(0.0), broadcast(0.0)  # of ln (det B / det B') and of det B
-    if compensate:
-        is_compensated = cov[6] > MIN_COMPENSATION * det_filtered
-        g_ln_ratio = select(is_compensated, (0.5 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i), g_ln_ratio)
-        g_det = select(is_compensated, g_ln_ratio / cov[6], g_det)
+    # The gradients of ln (det B / det B') and of det B.
+    is_compensated, zero = cov[6] > MIN_COMPENSATION * det_filtered, broadcast(0.0)
+    g_ln_ratio = select(is_compensated, (0.5 / math.log(2)) * _load_field(soa, layout.LOG2_PEAK, i), zero)
+    g_det = select(is_compensated, g_ln_ratio / cov[6], zero)
     g_aa = -0.5 * (dot(*g_a, *a) + alpha * g_alpha) - g_ln_ratio
     g_ab = -0.5 * (dot(*g_a, *b) + dot(*g_b, *a) + beta * g_alpha + alpha * g_beta)
     g_bb = -0.5 * (dot(*g_b, *b) + beta * g_beta) - g_ln_ratio

@@ -357,12 +357,6 @@ def any_lane(builder, condition):
     return _any(builder, condition)
 
 
-@_operation(types.uint64, mask)
-def mask_bits(builder, condition):
-    """The lanes of a mask as the lowest bits of a number."""
-    return builder.zext(builder.bitcast(condition, ir.IntType(LANES)), _LONG)
-
-
 @_operation(types.intp, types.uint64)
 def popcount(builder, bits):
     """Number of set bits of an unsigned 64-bit number."""

@@ -1,4 +1,4 @@
-"""A scene as one camera sees it, and the counts and times of a call."""
+"""A scene as one camera sees it, and the times of a call."""
 
 import time
 from collections.abc import Iterator
@@ -9,16 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
+from pansplat.constants import FILTER_VARIANCE
 from pansplat.rendering.cpu.projection import Camera, GaussianArrays, ProjectedGaussians
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions
-
-_MIN_FILTER_VARIANCE = 1e-9  # pixel^2: without a filter, a disc seen edge-on has width 0, and stage one divides by it
 
 
 class CameraView(NamedTuple):
-    """A scene, its projection for one camera, and the options.
+    """A scene, and its projection for one camera.
 
     Attributes:
         min_transmittance: a pixel is finished at this transmittance or below.
@@ -27,26 +25,20 @@ class CameraView(NamedTuple):
     gaussians: GaussianArrays
     camera: Camera
     projected: ProjectedGaussians
-    options: RasterOptions
     threads: int
     min_transmittance: float = MIN_TRANSMITTANCE
 
 
-def make_camera(pose: Tensor, plane: ImagePlane, options: RasterOptions) -> Camera:
+def make_camera(pose: Tensor, plane: ImagePlane, near: float) -> Camera:
     """The camera of a pose (cam2world), and the settings that depend on the size of the image plane's pixels."""
-    variance = max(options.filter_variance(plane.pixel_angle), _MIN_FILTER_VARIANCE * plane.pixel_angle**2)
-    return Camera(np.ascontiguousarray(pose.detach().numpy()), variance, options.compensate, options.near)
+    return Camera(np.ascontiguousarray(pose.detach().numpy()), FILTER_VARIANCE * plane.pixel_angle**2, near)
 
 
 @dataclass
 class Statistics:
-    """Counts, peak bytes of arrays and seconds by stage, collected for `RasterInfo`."""
+    """The number of Gaussians that reach an image, and seconds by stage."""
 
-    dropped: int = 0
-    near: int = 0
     visible: int = 0
-    intersections: int = 0
-    bytes: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import accumulate_slots
@@ -76,7 +77,6 @@ from pansplat.rendering.cpu.tiling import (
 )
 from pansplat.rendering.cpu.view import make_camera
 from pansplat.rendering.image_planes import image_planes
-from pansplat.rendering.rasterize import RasterOptions
 
 MAX_BAND_INTERSECTIONS = 1 << 18  # up to 10 million pairs: 0.3 GB
 MAX_STORED_PAIRS = 1 << 24  # 0.6 GB
@@ -115,10 +115,10 @@ class StoredWeights:
 
     def __init__(self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], size: tuple[int, int]) -> None:
         self._size, self._count, self._threads = size, len(gaussians), thread_count()
-        options, (plane,) = RasterOptions(), image_planes("equirect", size)
+        (plane,) = image_planes("equirect", size)
         fields = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics
         tensors = tuple(field.detach().contiguous() for field in fields)
-        arrays, camera = GaussianArrays.from_tensors(tensors), make_camera(cam2world.double(), plane, options)
+        arrays, camera = GaussianArrays.from_tensors(tensors), make_camera(cam2world.double(), plane, NEAR)
         self._workspace, self._tables = Workspace(), tabulate_pixels(plane)
         with announce_compilation():
             projected = project_gaussians(arrays, camera, self._workspace, self._threads)

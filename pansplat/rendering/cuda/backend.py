@@ -26,13 +26,11 @@ from pansplat.rendering.projection import (
     ray_footprints,
     select_drawable,
 )
-from pansplat.rendering.rasterize import RasterInfo, RasterOptions, RasterSums
+from pansplat.rendering.rasterize import RasterOptions
 from pansplat.system.devices import find_triton_problem
 
 if TYPE_CHECKING:
     from pansplat.rendering.cuda.tiling import Instances
-
-_SORTING_BYTES = 40  # for each intersection of the band that is being sorted
 
 
 def rasterize_planes(
@@ -40,7 +38,7 @@ def rasterize_planes(
     pose: Float[Tensor, "4 4"],
     planes: list[ImagePlane],
     options: RasterOptions,
-) -> RasterSums:
+) -> Float[Tensor, "plane sums height width"]:
     """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`."""
     device = gaussians.means.device
     _check_device(device)
@@ -48,19 +46,14 @@ def rasterize_planes(
         return reference.rasterize_planes(gaussians, pose, planes, options)
     # Triton launches on torch's current device, not on that of its arguments.
     with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
-        chosen = select_drawable(gaussians, pose.detach(), options)
         projected = project_gaussians(
-            chosen.gaussians,
+            select_drawable(gaussians, pose, options.near),
             pose,
             filter_variance=options.filter_variance(planes[0].pixel_angle),
-            compensate=options.compensate,
             exact=options.kernel == "ray",
         )
         footprints, instances = _compute_instances(projected, planes, options)
-        sums, count, size = _composite(footprints, instances, planes, exact=options.kernel == "ray")
-    visible = sum(instances.planes)
-    info = RasterInfo(chosen.total, chosen.dropped, chosen.near, visible, count, backend="triton", bytes=size)
-    return RasterSums(sums, info)
+        return _composite(footprints, instances, planes, exact=options.kernel == "ray")
 
 
 def _check_device(device: torch.device) -> None:
@@ -80,12 +73,11 @@ def project_gaussians(
     cam2world: Float[Tensor, "4 4"],
     *,
     filter_variance: float,
-    compensate: bool,
     exact: bool,
 ) -> ProjectedGaussians:
     """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`."""
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, gaussians.quats, gaussians.scales)
-    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, compensate, exact, *fields))
+    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, exact, *fields))
 
 
 class _Project(torch.autograd.Function):
@@ -93,25 +85,25 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, cam2world: Tensor, filter_variance: float, compensate: bool, exact: bool, *fields: Tensor
+        ctx: Any, cam2world: Tensor, filter_variance: float, exact: bool, *fields: Tensor
     ) -> tuple[Tensor, ...]:
         from pansplat.rendering.cuda.projection import project_forward
 
         fields = tuple(field.contiguous() for field in fields)
         ctx.save_for_backward(cam2world, *fields)
-        options: Any = dict(filter_variance=filter_variance, compensate=compensate, exact=exact)
-        ctx.options = options
-        return tuple(project_forward(cam2world, fields, **options))
+        ctx.options = filter_variance, exact
+        return tuple(project_forward(cam2world, fields, filter_variance, exact=exact))
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         from pansplat.rendering.cuda.projection_backward import backpropagate_projection
 
         cam2world, *fields = ctx.saved_tensors
+        filter_variance, exact = ctx.options
         grad_pose, *grad_fields = backpropagate_projection(
-            cam2world, fields, ProjectedGaussians(*grad_outputs), **ctx.options
+            cam2world, fields, ProjectedGaussians(*grad_outputs), filter_variance, exact=exact
         )
-        return grad_pose, None, None, None, *grad_fields
+        return grad_pose, None, None, *grad_fields
 
 
 def _compute_instances(
@@ -123,12 +115,10 @@ def _compute_instances(
     fixed = ProjectedGaussians(*(field.detach() for field in projected))
     boxes, keys, bases, parts, total = [], [], [], [], 0
     for plane in planes:
-        key, z = fixed.radius, fixed.radius
-        if not plane.is_panorama:
-            z = (fixed.direction * plane.rotation[:, 2]).sum(dim=1) * fixed.radius
-            key = z if options.order == "z" else key
+        key = fixed.radius
         if options.kernel == "ewa":
-            ahead = torch.nonzero(z > EWA_NEAR_FACTOR * options.near)[:, 0]
+            key = (fixed.direction * plane.rotation[:, 2]).sum(dim=1) * fixed.radius
+            ahead = torch.nonzero(key > EWA_NEAR_FACTOR * options.near)[:, 0]
             box = _compute_boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)
             visible = is_in_image(box, plane)
             seen, box = ahead[visible], box[visible]
@@ -169,8 +159,8 @@ class _SelectRows(torch.autograd.Function):
 
 def _composite(
     footprints: Footprints, instances: "Instances", planes: list[ImagePlane], *, exact: bool
-) -> tuple[Float[Tensor, "plane sums height width"], int, int]:
-    """Sum weight x (values, 1) along the rays of all image planes; count intersections and bytes of working memory.
+) -> Float[Tensor, "plane sums height width"]:
+    """Sum weight x (values, 1) along the rays of all image planes.
 
     Differentiable once in all of `footprints`.
     """
@@ -196,24 +186,21 @@ class _Composite(torch.autograd.Function):
         values: Tensor,
         setup: tuple[Any, ...],
         grad_enabled: bool,
-    ) -> tuple[Tensor, int, int]:
+    ) -> Tensor:
         from pansplat.rendering.cuda.rasterize import pack_records, rasterize
         from pansplat.rendering.cuda.tiling import intersect_tiles
 
         instances, pixels, layout, size = setup
         records = pack_records(Footprints(point, rows, radial_variance, peak, values), layout)
         sums = records.new_empty(len(instances.planes), layout.channels + 2, *size)
-        count, largest, kept = 0, 0, []
+        kept = []
         for band in intersect_tiles(instances):
             stops = rasterize(records, band, pixels, sums, layout)
-            count += len(band.record_ids)
-            largest = max(largest, _SORTING_BYTES * len(band.record_ids) + 8 * len(band.ends))
             if grad_enabled and any(ctx.needs_input_grad):  # needs_input_grad ignores no_grad
                 kept.append((band, stops))
         ctx.save_for_backward(records, rows, sums)
         ctx.setup, ctx.kept = setup, kept
-        held = (records, sums, pixels.centres, pixels.offsets, instances.records, instances.ranges)
-        return sums, count, largest + sum(t.numel() * t.element_size() for t in held)
+        return sums
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:

@@ -112,7 +112,7 @@ def backpropagate_quats(grad_axes, quats, index, mask):
 @triton.jit
 @no_type_check
 def backpropagate_shape(
-    c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad_radial_variance, SIZES: tl.constexpr
+    c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad_radial_variance, EXACT: tl.constexpr
 ):
     """Gradients of C's six entries, of the rotations of n towards u and v, and of the opacity.
 
@@ -122,23 +122,20 @@ def backpropagate_shape(
         frame: u, v, n.
         opacity: before the filter.
         grad_rows, grad_radial_variance: only read for the exact kernel.
-        SIZES: the kernel's COMPENSATE, EXACT.
     """
     det = minors[0] + e2 * minors[1] + e2 * e2
     zero = det * 0
     g, grad_det, turn_u, turn_v = (zero, zero, zero, zero, zero), zero, zero, zero
     grad_minors = (zero, zero, zero, zero, zero)
-    if SIZES[1]:
+    if EXACT:
         g, grad_det, turn_u, turn_v = backpropagate_rows(grad_rows, frame, c_uvn, e2, det)
         radial_variance = (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det
         grad_s = grad_radial_variance
-        grad_minors = (zero, zero, e2 * e2 * grad_s / det, e2 * grad_s / det, grad_s / det)
         grad_det -= grad_s * radial_variance / det
-    if SIZES[0]:
         ratio = minors[0] / det
         root = tl.sqrt(tl.maximum(ratio, MIN_RATIO))
         grad_ratio = tl.where(ratio >= MIN_RATIO, 0.5 * grad_peak * opacity / root, 0.0)
-        grad_minors = (grad_ratio / det, zero, grad_minors[2], grad_minors[3], grad_minors[4])
+        grad_minors = (grad_ratio / det, zero, e2 * e2 * grad_s / det, e2 * grad_s / det, grad_s / det)
         grad_det -= grad_ratio * ratio / det
         grad_peak = grad_peak * root
     grad_minors = (grad_minors[0] + grad_det, e2 * grad_det, grad_minors[2], grad_minors[3], grad_minors[4])
@@ -215,7 +212,7 @@ def backpropagate_projection_kernel(
     means, opacities, quats, scales, camera,
     grad_world_directions, grad_directions, grad_radii, grad_covariances, grad_peaks, grad_rows, grad_radial_variances,
     grad_means, grad_opacities, grad_quats, grad_scales, grad_camera, num,
-    COMPENSATE: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
+    EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """Write the gradients of the geometry; `grad_world_directions` are those of the colours."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -234,7 +231,7 @@ def backpropagate_projection_kernel(
         c_uvn, minors, (u, v, n), e2,
         load_fields(opacities, index, mask, 1)[0], load_fields(grad_peaks, index, mask, 1)[0],
         load_fields(grad_rows, index, mask, 9 if EXACT else 0), load_fields(grad_radial_variances, index, mask, 1)[0],
-        (COMPENSATE, EXACT),
+        EXACT,
     )  # fmt: skip
     tl.store(grad_opacities + index, grad_opacity, mask=mask)
     grad_n = load_fields(grad_directions, index, mask, 3)
@@ -267,9 +264,8 @@ def backpropagate_projection(
     cam2world: Float[Tensor, "4 4"],
     fields: list[Tensor],
     grads: ProjectedGaussians,
-    *,
     filter_variance: float,
-    compensate: bool,
+    *,
     exact: bool,
 ) -> tuple[Tensor, ...]:
     """Compute the gradient of the pose, then those of the fields.
@@ -278,7 +274,7 @@ def backpropagate_projection(
         cam2world: float64.
         fields: means, opacities, harmonics, quats, scales.
         grads: of the projected Gaussians.
-        filter_variance, compensate, exact: see `pansplat.rendering.projection.project_gaussians`.
+        filter_variance, exact: see `pansplat.rendering.projection.project_gaussians`.
     """
     means, opacities, harmonics, quats, scales = fields
     count = len(means)
@@ -297,7 +293,7 @@ def backpropagate_projection(
         grads.covariance.contiguous(), grads.peak.contiguous(), grads.rows.contiguous(),
         grads.radial_variance.contiguous(),
         grad_fields[0], grad_fields[1], grad_fields[3], grad_fields[4], parts, count,
-        COMPENSATE=compensate, EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=2,
+        EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=2,
     )  # fmt: skip
     grad_camera[:3] = parts.sum(dim=0)
     return grad_camera, *grad_fields

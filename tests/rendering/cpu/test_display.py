@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.constants import FILTER_VARIANCE, NEAR
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering.blend import blend
 from pansplat.rendering.cpu.display import (
@@ -16,10 +17,9 @@ from pansplat.rendering.cpu.display import (
     SelectionCache,
     blend_layers,
     blend_to_pixels,
-    enlarge,
 )
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import RasterOptions, rasterize
+from pansplat.rendering.rasterize import rasterize
 
 SIZE, FOV = (48, 70), 70.0
 FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(FOV) / 2)
@@ -63,14 +63,14 @@ def draw(display, pose, labels, layers, selection=None, size=SIZE, focal=FOCAL, 
     labels = labels if labels.dtype == np.int16 else labels.astype(np.int16)
     position = pose[:3, 3].numpy()
     chosen = {"selection": selection, "cache": cache}
-    return display.rasterize(position, plane, labels, layers, RasterOptions(), **chosen, min_transmittance=1e-7)
+    return display.rasterize(position, plane, labels, layers, NEAR, **chosen, min_transmittance=1e-7)
 
 
 def frustum(pose, scale=1.0):
     x, y = scale * 0.5 * SIZE[1] / FOCAL, scale * 0.5 * SIZE[0] / FOCAL
     normals = np.array(((-1, 0, x), (1, 0, x), (0, -1, y), (0, 1, y)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    deviation = math.sqrt(RasterOptions().filter_variance(1 / FOCAL))
+    deviation = math.sqrt(FILTER_VARIANCE) / FOCAL
     return Selection(normals @ pose[:3, :3].numpy().T, deviation)
 
 
@@ -125,7 +125,7 @@ def test_labels_without_a_layer_are_refused(labels, display, pose):
 
 def test_a_direct_panorama_has_the_axes_of_its_plane(scene, display, pose):
     plane = ImagePlane((32, 64), pose[:3, :3], 0.0)
-    layers = display.rasterize(pose[:3, 3].numpy(), plane, np.zeros(600, np.int16), 1, RasterOptions())
+    layers = display.rasterize(pose[:3, 3].numpy(), plane, np.zeros(600, np.int16), 1, NEAR)
     expected = rasterize(scene, pose, size=(32, 64), backend="numba")
     assert np.abs(layers.sums[0, :3] - expected.color.numpy()).max() <= 2e-3
 
@@ -157,16 +157,6 @@ def test_pixels_are_the_blended_layers_rounded(scene, display, pose, bottom_up):
     bytes_ = pixels.view(np.uint8).reshape(*SIZE, 4)[:: -1 if bottom_up else 1]
     assert np.abs(bytes_[..., :3] - 255 * np.clip(color[..., :3], 0, 1)).max() <= 0.51
     assert (bytes_[..., 3] == 255).all()
-
-
-@pytest.mark.parametrize("size", [(14, 20), (16, 33), (7, 11)])
-def test_enlarged_images_interpolate_between_pixel_centres(size):
-    image = np.random.default_rng(0).integers(0, 2**32, (7, 11), dtype=np.uint32)
-    pixels = np.empty(size, np.uint32)
-    enlarge(image, pixels)
-    channels = torch.from_numpy(image.view(np.uint8).reshape(7, 11, 4)).permute(2, 0, 1).double()
-    expected = torch.nn.functional.interpolate(channels[None], size, mode="bilinear")[0].permute(1, 2, 0).numpy()
-    assert np.abs(pixels.view(np.uint8).reshape(*size, 4) - expected).max() <= 3, "positions are rounded to 1/256"
 
 
 def test_sampled_faces_show_smooth_functions_of_the_direction_without_seams(pose):

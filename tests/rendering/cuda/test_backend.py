@@ -20,8 +20,7 @@ EXACT = dataclasses.replace(TRITON, dtype=torch.float64)
 
 
 def test_a_small_image_and_its_gradients_equal_float64_torch(make_scene, pose):
-    (_, got), _ = assert_dense(TRITON, make_scene(3, scale=0.4, degree=1), {"size": (4, 8), "pose": pose})
-    assert got.info.backend == "triton" and got.info.intersections > 0 and got.info.bytes > 0
+    assert_dense(TRITON, make_scene(3, scale=0.4, degree=1), {"size": (4, 8), "pose": pose})
 
 
 @exhaustive
@@ -30,8 +29,7 @@ def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene
 
     monkeypatch.setattr(stage, "_MANY_TILES", 4)
     scene = make_scene(2, scale=1.5, extent=0.8, seed=1, degree=0)
-    (_, got), _ = assert_dense(TRITON, scene, {"size": (48, 96), "pose": pose})
-    assert got.info.intersections > 2 * 16  # each has its own program, which sums in more than one step
+    assert_dense(TRITON, scene, {"size": (48, 96), "pose": pose})  # more than 16 tiles: a program sums in several steps
 
 
 @exhaustive
@@ -77,7 +75,6 @@ def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
     bands.append(draw())
     for narrow, found in bands:
         assert torch.equal(narrow.color, wide.color) and torch.equal(narrow.depth, wide.depth)
-        assert narrow.info.intersections == wide.info.intersections and narrow.info.bytes < wide.info.bytes
         for name, expected in gradients.items():
             assert torch.allclose(found[name], expected, rtol=1e-12, atol=1e-12), name
 
@@ -115,4 +112,4 @@ def test_auto_selects_triton_only_on_cuda(unchecked, monkeypatch):
 def select_automatically(*, is_cuda: bool) -> object:
     device = torch.device("cuda" if is_cuda else "cpu")
     means = types.SimpleNamespace(is_cuda=is_cuda, device=device, dtype=torch.float32)
-    return _select_backend("auto", types.SimpleNamespace(means=means), "ewa")
+    return _select_backend("auto", types.SimpleNamespace(means=means, harmonics=torch.zeros(1, 1, 3)), "ewa")

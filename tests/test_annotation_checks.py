@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from annotation_checks import check_types, restart_checks
 from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
-
-from pansplat.system.testing import check_types, restart_checks
 
 
 @jaxtyped(typechecker=check_types)

@@ -1,4 +1,4 @@
-"""Run-time checks of annotated shapes and types, enabled in tests/conftest.py."""
+"""Run-time checks of annotated shapes and types, enabled in conftest.py."""
 
 from __future__ import annotations
 
