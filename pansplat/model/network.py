@@ -96,28 +96,22 @@ class NetworkPredictor:
         """
         if images.ndim == 5:
             return [
-                self.predict_with_depths(
+                self._predict(
                     images[n],
                     cam2world[n],
                     select_item(near, n),
                     select_item(far, n),
-                    masks=None if masks is None else masks[n],
-                )[0]
+                    None if masks is None else masks[n],
+                )
                 for n in range(len(images))
             ]
-        return self.predict_with_depths(images, cam2world, near, far, masks=masks)[0]
+        return self._predict(images, cam2world, near, far, masks)
 
     @torch.no_grad()
-    def predict_with_depths(
-        self,
-        images: Float[Tensor, "view 3 height width"],
-        cam2world: Float[Tensor, "view 4 4"],
-        near: float | Tensor,
-        far: float | Tensor,
-        *,
-        masks: Bool[Tensor, "view height width"] | None = None,
-    ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """Predict Gaussians like `__call__`, and the radial depth maps of the swept levels, metres, coarse to fine."""
+    def _predict(
+        self, images: Tensor, cam2world: Tensor, near: float | Tensor, far: float | Tensor, masks: Tensor | None
+    ) -> Gaussians:
+        """Predict from one item; out of a card's memory with more tiles, then on the processor."""
         tiles = first = self.tiles or choose_tiles(images.shape[-2])
         while True:
             try:
@@ -131,9 +125,7 @@ class NetworkPredictor:
                 tiles = first
             note_full_card(self.name, f"{tiles}x{tiles} tiles" if tiles > first else "it runs on the processor")
         gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)
-        if masks is not None:
-            gaussians = remove_masked_gaussians(gaussians, cam2world, masks)
-        return gaussians, [depth[0].to(images.device) for depth in matched.depths.depth]
+        return gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
 
     def stream(
         self,

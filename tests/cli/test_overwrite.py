@@ -78,8 +78,6 @@ def test_the_folder_of_a_split_page_keeps_files_of_the_user(scene: Path, tmp_pat
         ("report.jsonl", ["batch", "{room}", "--model", "sphere"]),
         ("results.json", ["evaluate", "{room}", "--model", "sphere"]),
         ("room/target.png", ["evaluate", "{room}", "--model", "sphere"]),
-        ("table.md", ["evaluate", "--protocol", "m3d", "--data", "{room}", "--model", "sphere"]),
-        ("set/case/1_target.png", ["evaluate", "--protocol", "m3d", "--data", "{room}", "--model", "sphere"]),
         ("raster.json", ["bench", "raster", "--quick"]),
         ("raster.md", ["bench", "raster", "--quick"]),
         ("raster.png", ["bench", "raster", "--quick"]),

@@ -81,13 +81,6 @@ def test_masks_remove_only_the_gaussians_of_masked_pixels(predictor, prediction)
     assert len(remove_masked_gaussians(prediction, poses, ~torch.ones_like(masks))) == 0
 
 
-def test_predict_with_depths_also_returns_the_depth_of_each_swept_level(predictor, prediction):
-    gaussians, depths = predictor.predict_with_depths(*_inputs(), 0.5, 20.0)
-    assert torch.equal(gaussians.means, prediction.means)
-    assert [tuple(depth.shape) for depth in depths] == [(2, 8, 16), (2, 16, 32), (2, 32, 64)]
-    assert all(float(depth.min()) >= 0.5 - 1e-6 and float(depth.max()) <= 20 + 1e-4 for depth in depths)
-
-
 def test_a_stream_yields_the_same_gaussians_tile_by_tile_and_its_progress(small_config):
     predictor, (images, poses) = _predictor(small_config, tiles=2), _inputs()
     masks = torch.ones(2, 64, 128, dtype=torch.bool)
