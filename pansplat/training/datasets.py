@@ -9,12 +9,10 @@ from pansplat.training.config import DataConfig
 from pansplat.training.room import RoomTriplets
 from pansplat.training.sequences import BoundedSampler, read_loc360
 from pansplat.training.sources import (
-    ConcatSource,
     FixedFramePairs,
     PairSource,
     RandomFramePairs,
     SampleSource,
-    TripletSource,
     read_game_maps,
     read_panogrf,
 )
@@ -34,13 +32,9 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
     root = config.root
     assert root is not None
     if config.kind == "panogrf":
-        training, validation = (
-            ConcatSource([TripletSource(triplets) for triplets in read_panogrf(root, stage, height)])
-            for stage in ("train", "val")
-        )
-        return training, validation
+        return read_panogrf(root, "train", height), read_panogrf(root, "val", height)
     if config.kind in ("pairs", "triplets"):
-        read = _read_pairs if config.kind == "pairs" else _read_triplets
+        read = _read_pairs if config.kind == "pairs" else read_game_maps
         return read(root), read(config.validation_root or root)
     sampler = BoundedSampler(training_gap=config.training_gap)
     training = RandomFramePairs(read_loc360(root, "train"), sampler, config.draws)
@@ -49,8 +43,4 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
 
 
 def _read_pairs(folder: Path) -> PairSource:
-    return PairSource([pair for pair in load_pairs(folder) if pair.targets], targets=1)
-
-
-def _read_triplets(folder: Path) -> TripletSource:
-    return TripletSource(read_game_maps(folder))
+    return PairSource([pair for pair in load_pairs(folder) if pair.targets])

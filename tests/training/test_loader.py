@@ -12,7 +12,7 @@ from pansplat.images.image_files import write_image
 from pansplat.inputs.views import Batch
 from pansplat.training.augment import Augmentation
 from pansplat.training.loader import Loader
-from pansplat.training.sources import ConcatSource, TripletSource, read_game_maps
+from pansplat.training.sources import TripletSource, read_game_maps
 
 
 def _triplets(folder: Path, count: int) -> TripletSource:
@@ -21,7 +21,7 @@ def _triplets(folder: Path, count: int) -> TripletSource:
             write_image(folder / f"{k}_{i}.png", torch.full((3, 8, 16), (3 * k + i) / 40))
         poses = [[[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, k], [0, 0, 0, 1]] for i in range(3)]
         (folder / f"{k}.json").write_text(json.dumps({"c2w": poses}))
-    return TripletSource(read_game_maps(folder))
+    return read_game_maps(folder)
 
 
 def _take(loader: Loader, count: int, step: int = 0) -> list[Batch]:
@@ -89,6 +89,6 @@ def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) ->
 
 def test_empty_sources_and_batches_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="empty source"):
-        Loader(ConcatSource([]), height=8, batch_size=1)
+        Loader(TripletSource(()), height=8, batch_size=1)
     with pytest.raises(InputError, match="batch_size >= 1"):
         Loader(_triplets(tmp_path, 1), height=8, batch_size=0)
