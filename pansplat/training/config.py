@@ -14,7 +14,6 @@ from pansplat.errors import InputError
 from pansplat.model.layers import Compat, Precision
 from pansplat.system.options import Count, CountOrNone, Fraction, Minutes, Seed, check_numbers
 from pansplat.system.strict_json import convert, parse_json
-from pansplat.training.augment import Augmentation
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
 DataKind = Literal["room", "panogrf", "360loc", "pairs", "triplets"]
@@ -42,8 +41,8 @@ class DataConfig:
     """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
     workers: Annotated[int, Meta(ge=0, le=256)] = 2
     """Processes that read data; 0 to read in the training process."""
-    augmentation: Augmentation | None = field(default_factory=Augmentation)
-    """Random changes of samples; the official code has none."""
+    augmentation: bool = True
+    """Random yaw, mirroring and colours of samples; the official code has none."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,7 @@ def _differences(old: object, new: object, name: str = "") -> list[str]:
 
 _TRIPLETS = 19_950  # of Matterport3D
 _SEQUENCES = 13  # of 360Loc
-_MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=None)
+_MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=False)
 _PLAIN = MemoryConfig(style="cubemap")
 _TILED_2X2 = MemoryConfig("two-step", 2, "cubemap")
 _TILED_4X4 = MemoryConfig("two-step", 4, "cubemap")
@@ -239,7 +238,7 @@ def _loc360_preset(
         heights=(height,),
         perceptual="lpips-vgg",
         loss=_WITHOUT_DEPTH,
-        data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=None, training_gap="original"),
+        data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=False, training_gap="original"),
         network=network,
         memory=replace(memory, mixing="by_view"),
         optimizer=OptimizerConfig(steps=max(1, epochs * steps_per_epoch), batch_size=batch),

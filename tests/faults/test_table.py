@@ -125,7 +125,7 @@ TRAIN = "pansplat-train tiny --out run --device cpu"
 SIZES = [
     *(Fault(f"{command[:16]} {option} {value}", f"{command} {option} {value}", says=option) for command, option, value in (
         ("predict pair -o out.ply", "--height", "63"), ("predict pair -o out.ply", "--height", "abc"), ("predict pair -o out.ply", "--height", "9" * 5000),
-        (TRAIN, "--optimizer.batch-size", "0"), (TRAIN, "--data.augmentation.colour", "2"), ("pansplat-view scene.ply", "--fps", "nan"))),
+        (TRAIN, "--optimizer.batch-size", "0"), (TRAIN, "--optimizer.ema", "2"), ("pansplat-view scene.ply", "--fps", "nan"))),
     *(Fault(f"pose --baseline a.png b.png {distance}", f"pose pair --baseline a.png b.png {distance}", says="`baseline` must be") for distance in ("0", "nan")),
     Fault("pose --baseline of one panorama", "pose pair --baseline a.png a.png 1", says="`baseline` must be"),
     Fault("pose --baseline of a missing panorama", "pose pair --baseline a.png x.png 1", says="x.png"),

@@ -10,7 +10,6 @@ import torch
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
 from pansplat.inputs.views import Batch
-from pansplat.training.augment import Augmentation
 from pansplat.training.loader import Loader
 from pansplat.training.sources import TripletSource, read_game_maps
 
@@ -44,7 +43,7 @@ def test_each_epoch_is_a_permutation_of_all_samples(tmp_path: Path) -> None:
 
 
 def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path) -> None:
-    loader = Loader(_triplets(tmp_path, 5), height=8, batch_size=2, seed=3, augmentation=Augmentation(tilt_degrees=4))
+    loader = Loader(_triplets(tmp_path, 5), height=8, batch_size=2, seed=3, augmentation=True)
     whole = _take(loader, 7)
     assert _equal(_take(loader, 3, step=4), whole[4:])
     assert not _equal(_take(loader, 3, step=3), whole[4:])
@@ -54,7 +53,7 @@ def test_batches_from_a_step_equal_those_of_an_uninterrupted_run(tmp_path: Path)
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on one core
 def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 5)
-    options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": Augmentation(exposure=0.3)}
+    options = {"height": 8, "batch_size": 2, "seed": 1, "augmentation": True}
     alone = _take(Loader(source, **options), 3)
     assert _equal(_take(Loader(source, workers=2, **options), 3), alone)
     assert not _equal(_take(Loader(source, **(options | {"seed": 2})), 3), alone)
