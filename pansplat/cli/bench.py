@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pansplat.bench.harness import Suite
     from pansplat.bench.raster import BenchScene
     from pansplat.evaluation.results import Row
-    from pansplat.inputs.pairs import Pair
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
@@ -164,36 +163,17 @@ class BenchRefine(_Options):
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        from pansplat import pipeline
         from pansplat.bench.refine import REFINE, list_refine_cases, measure_refine
 
         self._check("refine")
-        pairs = _load_with_targets(self.paths)
+        found = [pair for path in _paths_or_sample(self.paths) for pair in pipeline.load_pairs(path)]
+        pairs = [pair for pair in found if pair.targets]
+        if not pairs:
+            raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
         cases = list_refine_cases(quick=self.quick)
         lpips = choose_lpips(self.lpips, min(case.height for case in cases))
         self._run(REFINE, measure_refine(pairs, cases, lpips), lpips=None if lpips is None else lpips.name)
-        return 0
-
-
-@dataclass(frozen=True)
-class BenchFlights(_Options):
-    """Measure pictures on the way between two panoramas: mixed, drawn jointly, and of each panorama alone."""
-
-    paths: Positional[tuple[Path, ...]] = ()
-    """Folders of pairs with targets, such as those of `pansplat-homes flights`; by default the sample."""
-    model: str = "default"
-    """Name of a predictor, or weights."""
-    height: Annotated[int, Meta(ge=64, le=8192, multiple_of=8)] = 512
-    """Height of the panoramas, pixels."""
-    lpips: LpipsChoice = field(default_factory=LpipsChoice)
-
-    def run(self) -> int:
-        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
-        from pansplat.bench.flights import FLIGHTS, measure_flights
-
-        self._check("flights")
-        pairs, lpips = _load_with_targets(self.paths), choose_lpips(self.lpips, self.height)
-        rows, name = measure_flights(pairs, self.model, self.height, lpips), None if lpips is None else lpips.name
-        self._run(FLIGHTS, rows, lpips=name, height=self.height)
         return 0
 
 
@@ -251,7 +231,6 @@ class Bench:
         Annotated[BenchRaster, subcommand("raster")]
         | Annotated[BenchModel, subcommand("model")]
         | Annotated[BenchRefine, subcommand("refine")]
-        | Annotated[BenchFlights, subcommand("flights")]
         | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchPose, subcommand("pose")]
     )
@@ -266,14 +245,3 @@ def _paths_or_sample(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     if not paths and not _SAMPLE.is_dir():
         raise InputError("give a folder (the sample is in the repository only)")
     return paths or (_SAMPLE,)
-
-
-def _load_with_targets(paths: tuple[Path, ...]) -> list[Pair]:
-    """The pairs of folders, by default of the sample, that have targets."""
-    from pansplat import pipeline
-
-    found = [pair for path in _paths_or_sample(paths) for pair in pipeline.load_pairs(path)]
-    pairs = [pair for pair in found if pair.targets]
-    if not pairs:
-        raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
-    return pairs
