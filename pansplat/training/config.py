@@ -85,9 +85,7 @@ class OptimizerConfig:
 
     steps: Count = 1000
     batch_size: Annotated[int, Meta(ge=1, le=4096)] = 2
-    """Samples per step and round of accumulation."""
-    accumulate: Annotated[int, Meta(ge=1, le=4096)] = 1
-    """Rounds of gradient accumulation per step."""
+    """Samples per step."""
     rate: Annotated[float, Meta(gt=0, le=1e3)] = 2e-4
     """Peak learning rate of Adam."""
     clip: Annotated[float, Meta(gt=0)] = 0.5
