@@ -20,7 +20,7 @@ DataKind = Literal["room", "panogrf", "360loc", "pairs", "triplets"]
 NetworkShape = Literal["paper", "small", "tiny"]
 Part = Literal["features", "cost_volume", "heads"]
 Backpropagation = Literal["plain", "one-step", "two-step"]
-Style = Literal["panorama", "cubemap", "original"]
+Style = Literal["panorama", "cubemap"]
 Mixing = Literal["joint", "by_view"]
 
 
@@ -74,7 +74,7 @@ class MemoryConfig:
     tiles: Annotated[int, Meta(ge=1, le=64)] = 1
     """Number of tiles along each side of the panorama."""
     style: Style = "panorama"
-    """panorama: one ray per pixel. cubemap: six cube faces. original: six cube faces as in the official code."""
+    """panorama: one ray per pixel. cubemap: six cube faces."""
     mixing: Mixing = "joint"
     """joint: all views' Gaussians in one image. by_view: one image per view, blended by distance."""
 

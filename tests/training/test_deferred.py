@@ -38,7 +38,6 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
     [
         ("cubemap", "by_view"),
         pytest.param("panorama", "joint", marks=pytest.mark.exhaustive),
-        pytest.param("original", "joint", marks=pytest.mark.exhaustive),
     ],
 )
 def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Callable, make_batch: Callable) -> None:
