@@ -38,7 +38,7 @@ from pansplat.system.files import SCENE_SUFFIXES
 from pansplat.system.store import Store, _pack
 from pansplat.system.strict_json import read_json
 from pansplat.tours.camera_path import read_path
-from pansplat.training.checkpoint import extract_weights, load_checkpoint
+from pansplat.training.checkpoint import load_checkpoint
 
 EYE = np.eye(4).tolist()
 IN_PART = "read in part: "
@@ -187,23 +187,20 @@ def _make_comment(folder: Path) -> InputFile:
 def _make_checkpoint(folder: Path) -> InputFile:
     """A training checkpoint; where its document has the network {"a": 1}, the file has a tensor of two ones."""
     path = folder / "training.pt"
-    weights = {"model": "pansplat", "config": {"a": 1}, "compat": "fixed"}
-    document = {"step": 3, "weights": weights, "network": {"a": 1}, "mean": None, "auxiliary": None, "optimizer": {}}
+    document = {"step": 3, "network": {"a": 1}, "mean": None, "auxiliary": None, "optimizer": {}}
 
     def pack(document: Any) -> bytes:
         if not isinstance(document, dict):
             torch.save(document, path)
             return path.read_bytes()
         changed = dict(document)
-        if "weights" in changed:
-            changed["weights"] = json.dumps(changed["weights"])
         if isinstance(network := changed.get("network"), dict) and network.get("a") == 1:
             changed["network"] = {"a": torch.ones(2)}
         torch.save({"kind": "pansplat-training", "format": 1, **changed}, path)
         return path.read_bytes()
 
     pack(document)
-    return InputFile(path, _whole(lambda path: extract_weights(load_checkpoint(path), path)), document, pack)
+    return InputFile(path, _whole(load_checkpoint), document, pack)
 
 
 def _make_network(folder: Path) -> InputFile:

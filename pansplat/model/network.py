@@ -245,11 +245,7 @@ def load_predictor(
     path, device = Path(path), choose_device("network")
     if device.type == "cpu" or precision not in get_args(Precision):
         require_precision(precision)
-    weights = (
-        convert_checkpoint(read_checkpoint(path), path)
-        if path.suffix.lower() in CHECKPOINT_SUFFIXES
-        else load_weights(path)
-    )
+    weights = read_weights(path)
     network = build_network(
         weights,
         weights.compat if compat == "trained" else compat,
@@ -258,6 +254,12 @@ def load_predictor(
         attention_precision=attention_precision,
     )
     return NetworkPredictor(weights.model, network.to(device))
+
+
+def read_weights(path: Path) -> WeightsFile:
+    """The content of a weights file, or that of an official checkpoint, converted."""
+    is_official = path.suffix.lower() in CHECKPOINT_SUFFIXES
+    return convert_checkpoint(read_checkpoint(path), path) if is_official else load_weights(path)
 
 
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:

@@ -58,7 +58,7 @@ class NetworkConfig:
     attention_precision: Precision = "float32"
     """Number type to which the inputs of attention are rounded."""
     init: Path | None = None
-    """Initial weights: a .safetensors, an official .ckpt, or a checkpoint of pansplat-train."""
+    """Initial weights: a .safetensors of `pansplat convert` or of training, or an official .ckpt."""
     frozen: tuple[Part, ...] = ()
     """Parts that are not trained; their normalisation statistics do not change either."""
     auxiliary: bool = False

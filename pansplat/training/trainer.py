@@ -6,7 +6,6 @@ and random numbers. A run that was killed therefore continues exactly as an unin
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -20,7 +19,6 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.inputs.views import Batch
-from pansplat.model.weights import pack_weights
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
@@ -232,11 +230,8 @@ class Trainer:
         return bool(every) and (self.step % every == 0 or self.step == self.config.optimizer.steps)
 
     def _state(self) -> dict[str, Any]:
-        weights = pack_weights(self.network.model, self.network.config, {}, compat=self.network.compat)
-        header = {"model": weights.model, "config": weights.config, "compat": weights.compat}
         return {
             "config": as_json(self.config),
-            "weights": json.dumps(header),
             "network": self.network.state_dict(),
             "auxiliary": None if self.auxiliary is None else self.auxiliary.state_dict(),
             "mean": None if self.average is None else self.average.state,
