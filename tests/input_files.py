@@ -20,7 +20,6 @@ from panorama_formats import EXAMPLES, Example, write_picture, write_room
 from PIL import Image
 
 from pansplat.cache import CachedScene, _is_valid
-from pansplat.cli.batch import list_items
 from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
@@ -282,7 +281,6 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
     "worlds": lambda folder: _make_pair(folder, "poses.json", _POSES | _WORLDS),
     "poses of two worlds": lambda folder: _make_pair(folder, "poses.json", _POSES | {"poses": _OTHER_WORLD}),
     "pairs": lambda folder: _make_pair(folder, "pairs.json", _PAIRS, poses=_POSES),
-    "manifest": lambda folder: _make_json(folder / "all.json", {"items": ["b", "a"]}, list_items),
     "key frames": lambda folder: _make_json(
         folder / "path.json", {"key_frames": [_KEY_FRAME], "software": "x"}, read_path
     ),
@@ -305,7 +303,7 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
 
 DOCUMENTS = [
     *(f"room, {name}" for name, example in EXAMPLES.items() if example.stated.endswith((".json", ".js"))),
-    *("worlds", "poses of two worlds", "pairs", "manifest", "key frames", "pose", "scene.glb", "scene comment"),
+    *("worlds", "poses of two worlds", "pairs", "key frames", "pose", "scene.glb", "scene comment"),
     *("network", "training checkpoint", "cube"),
 ]
 """The names of those with a JSON document."""

@@ -375,8 +375,8 @@ FILES = [
     Fault("a .sog of zeros", "info x.sog", content(b"PK\3\4" + bytes(99), "x.sog"), says="x.sog: needed a complete"),
     Fault("a .splat of 31 bytes", "info x.splat", content(bytes(31), "x.splat"), says="x.splat: needed a complete"),
     Fault("an empty .glb", "render x.glb -o x.png", content(b"", "x.glb"), says="needed a binary glTF file"),
-    *(Fault(f"manifest: {name}", "batch all.json --out out --model sphere", lambda f, text=text: (f / "all.json").write_text(text), says) for name, text, says in (
-        ("empty", "", "all.json: needed JSON"), ("no items", "{}", "needed folders with panoramas, got none"), ("not a path", '{"items": [{"path": "pair"}]}', "all.json"))),
+    Fault("a batch of a file", "batch pair/a.png --out out --model sphere", says="a.png: needed a readable folder"),
+    Fault("a batch of a folder without panoramas", "batch empty --out out --model sphere", lambda f: (f / "empty").mkdir(), "needed folders with panoramas, got none"),
     *(Fault(f"a batch {name}", f"batch pair --out out --model sphere {options}", says=says) for name, options, says in (
         ("of an unknown step", "--do predict,fly", "got 'fly'"), ("of an unknown format", "--format obj", "--format"), ("of points", "--format ply --gaussians 9", "--gaussians is for"),
         ("with workers of two kinds", "--workers 2 --scheduler tcp://a:1", "leave it out with --scheduler"), ("with no workers", "--workers 0", "--workers"),
