@@ -11,7 +11,6 @@ processor time of all threads). `peak_mb` is the largest additional memory of a 
 
 from __future__ import annotations
 
-import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -55,7 +54,7 @@ Precision = Literal["float32", "float64"]
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
-_MAX_CHOICE_HEIGHT = 512  # pixels: every choice needs a float64 reference of its own
+_MAX_CHOICE_HEIGHT = 512  # pixels: each layout needs a float64 reference
 _MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
 _HEADLINE = ("headline", "equirect", "float32")  # suite, layout and precision
 _MAX_PSNR = 160.0  # dB, of a plotted point
@@ -169,48 +168,29 @@ def choice_height(height: int, *, quick: bool) -> int:
     return min(_multiple_of_8(0.375 * height) if quick else height, _MAX_CHOICE_HEIGHT)
 
 
-def list_raster_groups(
-    scene_of: Callable[[int], BenchScene], height: int, backends: Sequence[str], threads: int, *, quick: bool
-) -> list[Group]:
-    """The main choices on the scene of this height, and all choices on the one of `choice_height`.
+def list_raster_groups(height: int, backends: Sequence[str], threads: int, *, quick: bool) -> list[Group]:
+    """The main choices on the room of this height, and also pinhole images on the one of `choice_height`.
 
     Args:
-        scene_of: the scene for a height.
         height: of the largest images, pixels.
         backends: available ones besides torch.
         threads: the largest number to use.
-        quick: minutes instead of an hour.
+        quick: whether `choice_height` is smaller.
     """
     small = choice_height(height, quick=quick)
     headline = [case for name in backends for case in list_main_choices(name, height, threads)]
     headline += [RasterCase(name, height) for name in backends if threads > 1]
     headline += [RasterCase("torch", height)] if lattice_room_size(height) <= _MAX_TORCH_GAUSSIANS else []
-    choices = [case for name in backends for case in list_choices(name, small, threads)]
-    choices += list_main_choices("torch", small, 1) + ([] if quick else list_choices("torch", small, 1))
-    choices = list(dict.fromkeys(choices))
-    return [Group("headline", scene_of(height), headline), Group("choices", scene_of(small), choices)]
+    choices = [case for name in backends for case in list_main_choices(name, small, threads)]
+    choices += [RasterCase(name, small, layout="pinhole", threads=threads) for name in backends]
+    choices += list_main_choices("torch", small, 1)
+    return [Group("headline", make_room_scene(height), headline), Group("choices", make_room_scene(small), choices)]
 
 
 def make_sample_group(scene: BenchScene, height: int, backends: Sequence[str], threads: int) -> Group:
     """The main choices on a real scene, to check the results of the room."""
     cases = [case for name in backends for case in list_main_choices(name, height, threads)]
     return Group("scene", scene, cases + list_main_choices("torch", height, 1))
-
-
-def list_choices(backend: str, height: int, threads: int) -> list[RasterCase]:
-    """Every kernel, order and filter on every layout that has them; an equirect has one kernel and one order."""
-    direct, kernels = RasterCase(backend, height, threads=threads), _kernels(backend)
-    orders: tuple[Order, ...] = ("radial",) if backend == "numba" else ("radial", "z")
-    filters: tuple[Lowpass, ...] = ("angular", "3dgs")
-    stitched = replace(direct, layout="cubemap", face_size=default_face_size(height))
-    return [
-        *(replace(direct, filter=lowpass) for lowpass in filters),
-        *(
-            replace(stitched, kernel=kernel, order=order, filter=lowpass)
-            for kernel, order, lowpass in itertools.product(kernels, orders, filters)
-        ),
-        *(replace(direct, kernel=kernel, layout="pinhole") for kernel in kernels),
-    ]
 
 
 def list_main_choices(backend: str, height: int, threads: int) -> list[RasterCase]:
@@ -226,12 +206,7 @@ def list_main_choices(backend: str, height: int, threads: int) -> list[RasterCas
         face_size=official_face_size(height),
         stitching="seamless" if height % 4 else OFFICIAL.stitching,
     )
-    cases = [direct, stitched, replace(stitched, kernel="ewa"), official]
-    return [case for case in cases if case.kernel in _kernels(backend)]
-
-
-def _kernels(backend: str) -> tuple[Kernel, ...]:
-    return ("ray",) if backend == "numba" else ("ray", "ewa")
+    return [direct, stitched] if backend == "numba" else [direct, stitched, replace(stitched, kernel="ewa"), official]
 
 
 def default_face_size(height: int) -> int:

@@ -96,8 +96,6 @@ def test_more_files_than_the_named_one_need_overwrite(room: Path, tmp_path: Path
     own = write_own(tmp_path / "report.json")
     command = ["refine", room, "-o", tmp_path / "out.ply", "--report", own]
     assert f"--report: needed names of new files, got {own}" in refusal(*command)
-    command = ["bench", "raster", "--quick", "--json", own]
-    assert f"got {own}, which pansplat did not write" in refusal(*command)
     command = ["convert", tmp_path / "official.ckpt", "-o", write_own(tmp_path / "model.safetensors")]
     assert "--overwrite" in refusal(*command)
 

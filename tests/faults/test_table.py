@@ -141,7 +141,7 @@ SIZES = [
         ("tiny --optimizer.steps 0", "--optimizer.steps: needed a whole number >= 1, got 0"), ("pansplat-256 --data.root nowhere", "--network.init"), ("tiny --network.init none.safetensors", "none.safetensors"),
         ("", "tiny"), ("gigantic", "gigantic"), ("tiny --optimizer.stepps 3", "--optimizer.steps"), ("tiny --memory.backpropagation three-step", "two-step"))),
     *(Fault(f"bench {options}", f"bench {options}", says=says) for options, says in (
-        ("raster --height 20", "multiple of 8"), ("raster --height 7", "--height: needed"), ("raster --threads 0", "--threads: needed a whole number >= 1"), ("raster --json no/rows.json", "create it first"),
+        ("raster --height 20", "multiple of 8"), ("raster --height 7", "--height: needed"), ("raster --threads 0", "--threads: needed a whole number >= 1"), ("raster --json rows.json", "--json"),
         ("raster none.ply", "none.ply"), ("model --height 80", "multiple of 64"), ("model --pair nowhere", "nowhere is not a folder"), ("model --height 64 --model none.safetensors", "none.safetensors"),
         ("viewer --heights 20", "multiple of 8"), ("viewer --size 8 8", "--size, [0]: needed a whole number >= 64"))),
     Fault("an option without its number", "predict pair -o out.ply --height", says="--height"),
