@@ -56,7 +56,6 @@ _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
 _MAX_CHOICE_HEIGHT = 512  # pixels: each layout needs a float64 reference
 _MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
-_HEADLINE = ("headline", "equirect", "float32")  # suite, layout and precision
 _MAX_PSNR = 160.0  # dB, of a plotted point
 
 
@@ -326,26 +325,6 @@ def _format_time(name: str) -> Callable[[Row], str]:
     return format_row
 
 
-def list_findings(rows: Sequence[Row]) -> list[str]:
-    """Speed against torch, as sentences."""
-    direct = [row for row in rows if tuple(map(row.get, ("suite", "layout", "precision"))) == _HEADLINE]
-    slow = next((row for row in direct if row.get("backend") == "torch" and row.get("forward_ms")), None)
-    if slow is None:
-        return []
-    return [
-        f"{row.get('backend')} on {format_threads(row.get('threads'))} is {_quotient('forward_ms', slow, row)} times "
-        f"as fast forward and {_quotient('backward_ms', slow, row)} times backward as torch on one (processor time: "
-        f"{_quotient('forward_cpu_ms', slow, row)} and {_quotient('backward_cpu_ms', slow, row)} times less), "
-        f"{_describe_size(row)}."
-        for row in sorted(direct, key=lambda row: (row.get("backend"), row.get("threads")))
-        if row is not slow and row.get("forward_ms")
-    ]
-
-
-def _quotient(name: str, slow: Row, fast: Row) -> str:
-    return f"{slow.get(name) / fast.get(name):,.0f}" if slow.get(name) and fast.get(name) else "?"
-
-
 def _describe_size(row: Row) -> str:
     return f"{row.get('height')}x{2 * row.get('height')}, {row.get('num_gaussians'):,} Gaussians"
 
@@ -398,6 +377,5 @@ RASTER = Suite(
     ),
     lambda row: f"{row.get('suite')}: {row.get('scene')}",
     plot_choices,
-    list_findings,
     width=210,
 )

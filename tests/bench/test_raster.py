@@ -1,4 +1,4 @@
-"""`pansplat bench raster`: errors against the exact image, files, findings of equal rows; refused arguments."""
+"""`pansplat bench raster`: errors against the exact image, and files."""
 
 import json
 import math
@@ -56,4 +56,4 @@ def test_the_quick_run_writes_rows_and_a_plot_and_prints_the_tables(tmp_path, ca
     assert content["machine"]["threads"] == 1
     assert sorted(file.name for file in out.iterdir()) == ["raster.json", "raster.md", "raster.png"]
     printed = capsys.readouterr().out
-    assert all(word in printed for word in ("headline", "choices", "PSNR dB", "numba on one thread is"))
+    assert all(word in printed for word in ("headline", "choices", "PSNR dB"))
