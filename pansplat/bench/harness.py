@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Header = Mapping[str, Any]
 
+_WIDTH = 210  # characters of a printed line if there is no terminal
 MEAN = "mean"  # scene of the rows that average all others
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _PACKAGES = ("pansplat", "torch", "numpy", "numba")
@@ -49,7 +50,6 @@ class Suite:
         section: title of the table that a row belongs to.
         plot: a function that plots the rows, given also the header of the JSON file; None if there is nothing to plot.
         findings: sentences about all rows, for the terminal and the page.
-        width: characters of a printed line if there is no terminal.
     """
 
     name: str
@@ -57,7 +57,6 @@ class Suite:
     section: Callable[[Row], str]
     plot: Callable[[Sequence[Row], Header], Figure | None]
     findings: Callable[[Sequence[Row]], list[str]] = lambda rows: []
-    width: int = 190
 
     def sections(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
         """The rows of each table by its title."""
@@ -87,7 +86,7 @@ def run(suite: Suite, measured: Iterable[Row], header: Header, out: Path | None 
     finally:
         machine, sections, findings = header["machine"], suite.sections(rows), suite.findings(rows)
         print(f"{machine['cpu']}, GPU: {machine['gpu'] or 'none'}, {format_threads(machine['threads'])}")
-        console = make_table_console(suite.width)
+        console = make_table_console(_WIDTH)
         for title, part in sections.items():
             console.print(rich_table(title, suite.columns, part))
         for line in findings:

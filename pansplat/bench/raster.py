@@ -377,5 +377,4 @@ RASTER = Suite(
     ),
     lambda row: f"{row.get('suite')}: {row.get('scene')}",
     plot_choices,
-    width=210,
 )

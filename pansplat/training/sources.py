@@ -16,10 +16,23 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import find_panogrf, find_triplets, read_panogrf_scene, read_triplet
+from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
-from pansplat.training.sequences import BoundedSampler, FramePair, ImageSequence, Stage, read_frame_pair
+from pansplat.training.config import DataConfig
+from pansplat.training.room import RoomTriplets
+from pansplat.training.sequences import (
+    BoundedSampler,
+    FramePair,
+    ImageSequence,
+    Stage,
+    read_frame_pair,
+    read_loc360,
+)
+
+_VALIDATION_SEED_OFFSET = 1_000_003  # rooms differ from those of training
+_VALIDATION_DRAWS = 4  # frame pairs per sequence
 
 
 class SampleSource(Protocol):
@@ -144,3 +157,28 @@ def read_game_maps(folder: Path | str) -> TripletSource:
             f"{folder}: needed triplets (NAME.json with NAME_0.png next to it), got none; see docs/input.md."
         )
     return TripletSource(sources)
+
+
+def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSource, SampleSource]:
+    """Training samples, and validation samples, which have at least one target.
+
+    Args:
+        height: height of the panoramas; selects the folder of some data sets.
+    """
+    if config.kind == "room":
+        return RoomTriplets(seed), RoomTriplets(seed + _VALIDATION_SEED_OFFSET)
+    root = config.root
+    assert root is not None
+    if config.kind == "panogrf":
+        return read_panogrf(root, "train", height), read_panogrf(root, "val", height)
+    if config.kind in ("pairs", "triplets"):
+        read = _read_pairs if config.kind == "pairs" else read_game_maps
+        return read(root), read(config.validation_root or root)
+    sampler = BoundedSampler(training_gap=config.training_gap)
+    training = RandomFramePairs(read_loc360(root, "train"), sampler, config.draws)
+    unseen = read_loc360(root, "val")
+    return training, FixedFramePairs(unseen, lambda count: sampler.evaluation(count, _VALIDATION_DRAWS))
+
+
+def _read_pairs(folder: Path) -> PairSource:
+    return PairSource([pair for pair in load_pairs(folder) if pair.targets])

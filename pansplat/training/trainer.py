@@ -23,7 +23,6 @@ from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
-from pansplat.training.datasets import load_sources
 from pansplat.training.loader import Loader
 from pansplat.training.logs import CsvTable, ProgressDisplay, plot_run
 from pansplat.training.losses import choose_perceptual
@@ -36,6 +35,7 @@ from pansplat.training.network import (
 )
 from pansplat.training.optimization import ExponentialMovingAverage, one_cycle_rate
 from pansplat.training.rendering import TargetRenderer
+from pansplat.training.sources import load_sources
 from pansplat.training.step import LOSS_TERMS, TrainingStep
 from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, describe_measures, validate

@@ -12,7 +12,8 @@ import torch
 from pansplat.errors import InputError
 from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.views import collate
-from pansplat.training.sources import PairSource, TripletSource, read_game_maps, read_panogrf
+from pansplat.training.config import DataConfig
+from pansplat.training.sources import PairSource, TripletSource, load_sources, read_game_maps, read_panogrf
 
 
 @pytest.fixture
@@ -86,3 +87,12 @@ def test_pairs_need_targets_and_a_random_one_is_chosen(
     assert chosen == {("1",), ("2",), ("3",)}
     with pytest.raises(InputError, match="needed pairs with targets for training, got none"):
         PairSource([])
+
+
+@pytest.mark.shared
+def test_a_folder_of_triplets_is_read_as_triplets_and_as_pairs(shared: Path) -> None:
+    root = shared / "data" / "bsp_demo"
+    for source in load_sources(DataConfig("triplets", root), 64, 0):
+        assert isinstance(source, TripletSource) and len(source) == 12
+    for source in load_sources(DataConfig("pairs", root), 64, 0):
+        assert isinstance(source, PairSource) and len(source) == 12
