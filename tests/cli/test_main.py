@@ -138,7 +138,6 @@ REFUSED = {
     "export room -o room --training-set": "needed a new or empty folder, got one with files",
     "export room -o x --training-set --crop 0 0 0 1 1 1": "--remove-floaters are not for a folder to train from",
     "evaluate -o x": "at least one folder",
-    "evaluate room -o x --protocol m3d": "Unrecognized options: --protocol",
     "evaluate room -o x --model sphere --lpips vgg": "LPIPS with vgg needed vgg16-397923af",
     "convert path.txt -o x.ckpt": "--out must end in .safetensors",
     "convert path.txt -o no/x.safetensors": "existing folder",
