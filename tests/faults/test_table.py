@@ -376,7 +376,6 @@ FILES = [
     Fault("a .splat of 31 bytes", "info x.splat", content(bytes(31), "x.splat"), says="x.splat: needed a complete"),
     Fault("an empty .glb", "render x.glb -o x.png", content(b"", "x.glb"), says="needed a binary glTF file"),
     Fault("a batch of a file", "batch pair/a.png --out out --model sphere", says="a.png: needed a readable folder"),
-    Fault("a batch of a folder without panoramas", "batch empty --out out --model sphere", lambda f: (f / "empty").mkdir(), "needed folders with panoramas, got none"),
     *(Fault(f"a batch {name}", f"batch pair --out out --model sphere {options}", says=says) for name, options, says in (
         ("of an unknown step", "--do predict,fly", "got 'fly'"), ("of an unknown format", "--format obj", "--format"), ("of points", "--format ply --gaussians 9", "--gaussians is for"),
         ("with workers of two kinds", "--workers 2 --scheduler tcp://a:1", "leave it out with --scheduler"), ("with no workers", "--workers 0", "--workers"),
