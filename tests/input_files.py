@@ -20,7 +20,6 @@ from panorama_formats import EXAMPLES, Example, write_picture, write_room
 from PIL import Image
 
 from pansplat.cache import CachedScene, _is_valid
-from pansplat.cli.batch import list_items
 from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
@@ -38,7 +37,7 @@ from pansplat.system.files import SCENE_SUFFIXES
 from pansplat.system.store import Store, _pack
 from pansplat.system.strict_json import read_json
 from pansplat.tours.camera_path import read_path
-from pansplat.training.checkpoint import extract_weights, load_checkpoint
+from pansplat.training.checkpoint import load_checkpoint
 
 EYE = np.eye(4).tolist()
 IN_PART = "read in part: "
@@ -187,23 +186,20 @@ def _make_comment(folder: Path) -> InputFile:
 def _make_checkpoint(folder: Path) -> InputFile:
     """A training checkpoint; where its document has the network {"a": 1}, the file has a tensor of two ones."""
     path = folder / "training.pt"
-    weights = {"model": "pansplat", "config": {"a": 1}, "compat": "fixed"}
-    document = {"step": 3, "weights": weights, "network": {"a": 1}, "mean": None, "auxiliary": None, "optimizer": {}}
+    document = {"step": 3, "network": {"a": 1}, "mean": None, "auxiliary": None, "optimizer": {}}
 
     def pack(document: Any) -> bytes:
         if not isinstance(document, dict):
             torch.save(document, path)
             return path.read_bytes()
         changed = dict(document)
-        if "weights" in changed:
-            changed["weights"] = json.dumps(changed["weights"])
         if isinstance(network := changed.get("network"), dict) and network.get("a") == 1:
             changed["network"] = {"a": torch.ones(2)}
         torch.save({"kind": "pansplat-training", "format": 1, **changed}, path)
         return path.read_bytes()
 
     pack(document)
-    return InputFile(path, _whole(lambda path: extract_weights(load_checkpoint(path), path)), document, pack)
+    return InputFile(path, _whole(load_checkpoint), document, pack)
 
 
 def _make_network(folder: Path) -> InputFile:
@@ -280,7 +276,6 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
     "worlds": lambda folder: _make_pair(folder, "poses.json", _POSES | _WORLDS),
     "poses of two worlds": lambda folder: _make_pair(folder, "poses.json", _POSES | {"poses": _OTHER_WORLD}),
     "pairs": lambda folder: _make_pair(folder, "pairs.json", _PAIRS, poses=_POSES),
-    "manifest": lambda folder: _make_json(folder / "all.json", {"items": ["b", "a"]}, list_items),
     "key frames": lambda folder: _make_json(
         folder / "path.json", {"key_frames": [_KEY_FRAME], "software": "x"}, read_path
     ),
@@ -302,7 +297,7 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
 
 DOCUMENTS = [
     *(f"room, {name}" for name, example in EXAMPLES.items() if example.stated.endswith((".json", ".js"))),
-    *("worlds", "poses of two worlds", "pairs", "manifest", "key frames", "pose", "scene.glb", "scene comment"),
+    *("worlds", "poses of two worlds", "pairs", "key frames", "pose", "scene.glb", "scene comment"),
     *("network", "training checkpoint", "cube"),
 ]
 """The names of those with a JSON document."""

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Header = Mapping[str, Any]
 
+_WIDTH = 210  # characters of a printed line if there is no terminal
 MEAN = "mean"  # scene of the rows that average all others
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _PACKAGES = ("pansplat", "torch", "numpy", "numba")
@@ -49,7 +50,6 @@ class Suite:
         section: title of the table that a row belongs to.
         plot: a function that plots the rows, given also the header of the JSON file; None if there is nothing to plot.
         findings: sentences about all rows, for the terminal and the page.
-        width: characters of a printed line if there is no terminal.
     """
 
     name: str
@@ -57,7 +57,6 @@ class Suite:
     section: Callable[[Row], str]
     plot: Callable[[Sequence[Row], Header], Figure | None]
     findings: Callable[[Sequence[Row]], list[str]] = lambda rows: []
-    width: int = 190
 
     def sections(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
         """The rows of each table by its title."""
@@ -67,36 +66,33 @@ class Suite:
         return sections
 
 
-def run(
-    suite: Suite, measured: Iterable[Row], header: Header, json_file: Path | None = None, out: Path | None = None
-) -> list[Row]:
+def run(suite: Suite, measured: Iterable[Row], header: Header, out: Path | None = None) -> list[Row]:
     """Measure the rows, print their tables and findings, and write the files; return the rows.
 
-    The rows so far are written after each one, and printed if the run is interrupted.
+    The rows so far are written as NAME.json after each one, and printed if the run is interrupted.
 
     Args:
         measured: rows as they are measured; a changed row may be yielded again.
         header: values of the JSON file beside the rows and the machine.
-        json_file: by default NAME.json in `out`, if that is given.
-        out: folder for the page and the plot.
+        out: folder for the files; None for none.
     """
     header = {"machine": describe_machine(), **header}
-    json_file = json_file or (out and out / f"{suite.name}.json")
     rows: list[Row] = []
     try:
         for row in measured:
             rows += [] if any(row is known for known in rows) else [row]
-            if json_file is not None:
-                write_json({**header, "rows": [known.as_json() for known in rows]}, json_file)
+            if out is not None:
+                write_json({**header, "rows": [known.as_json() for known in rows]}, out / f"{suite.name}.json")
     finally:
         machine, sections, findings = header["machine"], suite.sections(rows), suite.findings(rows)
         print(f"{machine['cpu']}, GPU: {machine['gpu'] or 'none'}, {format_threads(machine['threads'])}")
-        console = make_table_console(suite.width)
+        console = make_table_console(_WIDTH)
         for title, part in sections.items():
             console.print(rich_table(title, suite.columns, part))
-        for line in (*findings, *([json_file] if json_file and rows else [])):
+        for line in findings:
             print(line)
         if out is not None and rows:
+            print(out / f"{suite.name}.json")
             tables = [markdown_table(title, suite.columns, part) for title, part in sections.items()]
             text = "\n".join([*(f"* {sentence}" for sentence in findings), *([""] if findings else []), *tables])
             with replacing(out / f"{suite.name}.md") as partial:

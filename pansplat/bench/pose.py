@@ -169,5 +169,4 @@ POSE = Suite(
     lambda row: row.get("suite"),
     plot_poses,
     summarise,
-    width=150,
 )

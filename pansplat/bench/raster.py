@@ -54,9 +54,8 @@ Precision = Literal["float32", "float64"]
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
-_MAX_CHOICE_HEIGHT = 512  # pixels: every choice needs a float64 reference of its own
+_MAX_CHOICE_HEIGHT = 512  # pixels: each layout needs a float64 reference
 _MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
-_HEADLINE = ("headline", "equirect", "float32")  # suite, layout and precision
 _MAX_PSNR = 160.0  # dB, of a plotted point
 
 
@@ -160,25 +159,23 @@ def choice_height(height: int, *, quick: bool) -> int:
     return min(_multiple_of_8(0.375 * height) if quick else height, _MAX_CHOICE_HEIGHT)
 
 
-def list_raster_groups(
-    scene_of: Callable[[int], BenchScene], height: int, backends: Sequence[str], threads: int, *, quick: bool
-) -> list[Group]:
-    """All choices on the scene of this height, and on the one of `choice_height`.
+def list_raster_groups(height: int, backends: Sequence[str], threads: int, *, quick: bool) -> list[Group]:
+    """The main choices on the room of this height, and also pinhole images on the one of `choice_height`.
 
     Args:
-        scene_of: the scene for a height.
         height: of the largest images, pixels.
         backends: available ones besides torch.
         threads: the largest number to use.
-        quick: minutes instead of an hour.
+        quick: whether `choice_height` is smaller.
     """
     small = choice_height(height, quick=quick)
     headline = [case for name in backends for case in list_choices(name, height, threads)]
     headline += [RasterCase(name, height) for name in backends if threads > 1]
     headline += [RasterCase("torch", height)] if lattice_room_size(height) <= _MAX_TORCH_GAUSSIANS else []
     choices = [case for name in backends for case in list_choices(name, small, threads)]
+    choices += [RasterCase(name, small, layout="pinhole", threads=threads) for name in backends]
     choices += list_choices("torch", small, 1)
-    return [Group("headline", scene_of(height), headline), Group("choices", scene_of(small), choices)]
+    return [Group("headline", make_room_scene(height), headline), Group("choices", make_room_scene(small), choices)]
 
 
 def make_sample_group(scene: BenchScene, height: int, backends: Sequence[str], threads: int) -> Group:
@@ -188,15 +185,11 @@ def make_sample_group(scene: BenchScene, height: int, backends: Sequence[str], t
 
 
 def list_choices(backend: str, height: int, threads: int) -> list[RasterCase]:
-    """The direct panorama, pinhole images, and the stitched panoramas, by each kernel that has them."""
+    """The direct panorama, the stitched one and, where the backend has it, the official drawing."""
     direct = RasterCase(backend, height, threads=threads)
-    pinhole, stitched = replace(direct, layout="pinhole"), replace(direct, layout="cubemap")
-    cases = [direct, pinhole, replace(stitched, face_size=default_face_size(height))]
-    if backend != "numba":
-        cases.append(replace(pinhole, kernel="ewa"))
-        if height % 4 == 0:
-            cases.append(replace(stitched, kernel="ewa", face_size=official_face_size(height)))
-    return cases
+    stitched = replace(direct, layout="cubemap", face_size=default_face_size(height))
+    official = replace(stitched, kernel="ewa", face_size=official_face_size(height))
+    return [direct, stitched, *([] if backend == "numba" or height % 4 else [official])]
 
 
 def default_face_size(height: int) -> int:
@@ -316,26 +309,6 @@ def _format_time(name: str) -> Callable[[Row], str]:
     return format_row
 
 
-def list_findings(rows: Sequence[Row]) -> list[str]:
-    """Speed against torch, as sentences."""
-    direct = [row for row in rows if tuple(map(row.get, ("suite", "layout", "precision"))) == _HEADLINE]
-    slow = next((row for row in direct if row.get("backend") == "torch" and row.get("forward_ms")), None)
-    if slow is None:
-        return []
-    return [
-        f"{row.get('backend')} on {format_threads(row.get('threads'))} is {_quotient('forward_ms', slow, row)} times "
-        f"as fast forward and {_quotient('backward_ms', slow, row)} times backward as torch on one (processor time: "
-        f"{_quotient('forward_cpu_ms', slow, row)} and {_quotient('backward_cpu_ms', slow, row)} times less), "
-        f"{_describe_size(row)}."
-        for row in sorted(direct, key=lambda row: (row.get("backend"), row.get("threads")))
-        if row is not slow and row.get("forward_ms")
-    ]
-
-
-def _quotient(name: str, slow: Row, fast: Row) -> str:
-    return f"{slow.get(name) / fast.get(name):,.0f}" if slow.get(name) and fast.get(name) else "?"
-
-
 def _describe_size(row: Row) -> str:
     return f"{row.get('height')}x{2 * row.get('height')}, {row.get('num_gaussians'):,} Gaussians"
 
@@ -388,6 +361,4 @@ RASTER = Suite(
     ),
     lambda row: f"{row.get('suite')}: {row.get('scene')}",
     plot_choices,
-    list_findings,
-    width=210,
 )

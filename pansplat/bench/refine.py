@@ -201,5 +201,4 @@ REFINE = Suite(
     ),
     lambda row: row.get("scene"),
     plot_refine,
-    width=175,
 )

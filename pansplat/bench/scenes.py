@@ -49,7 +49,7 @@ def lattice_room_size(height: int) -> int:
     return 2 * sum(lattice_size(2 * height >> level) for level in range(NUM_LEVELS))
 
 
-def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int = 0) -> Gaussians:
+def full_lattice_room(height: int, *, views: int = 2) -> Gaussians:
     """A furnished room as panoramas of that height see it: every point of every level's lattice is a Gaussian.
 
     The Gaussians are discs on the surfaces, 0.5 to 1 pixel of their level wide, of opacity 0.3 to 0.95, which are the
@@ -58,8 +58,6 @@ def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int
     Args:
         height: of the panoramas, pixels; a multiple of 8.
         views: number of input cameras.
-        degree: of the spherical harmonics, 0..4.
-        seed: of sizes, opacities and colours.
 
     Returns:
         float32 Gaussians, 886,580 at a height of 512.
@@ -69,14 +67,14 @@ def full_lattice_room(height: int, *, views: int = 2, degree: int = 0, seed: int
     """
     if height < 8 or height % 8:
         raise ValueError(f"`height` must be a positive multiple of 8, got {height}")
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     parts = []
     for level in range(NUM_LEVELS):
         rays = fibonacci_directions(lattice_size(2 * height >> level))
         pixel_angle = math.pi / (height >> level)
         for view, pose in enumerate(make_room_cameras(views)):
             for chunk in rays.split(_CHUNK):
-                parts.append(_make_discs(chunk, pose[:3, 3], pixel_angle, degree, generator, level, view))
+                parts.append(_make_discs(chunk, pose[:3, 3], pixel_angle, generator, level, view))
     return Gaussians.cat(parts)
 
 
@@ -84,7 +82,6 @@ def _make_discs(
     rays: Float[Tensor, "n 3"],
     position: Float[Tensor, "3"],
     pixel_angle: float,
-    degree: int,
     generator: torch.Generator,
     level: int,
     view: int,
@@ -106,7 +103,7 @@ def _make_discs(
         scales=torch.stack((width * stretch, width, width * _THICKNESS), dim=1).float(),
         quats=quats_from_rotations(axes).float(),
         opacities=opacity.float(),
-        harmonics=_make_harmonics(points, surface, degree, generator),
+        harmonics=_paint(points, surface, generator),
         levels=torch.full((len(rays),), level, dtype=torch.uint8),
         views=torch.full((len(rays),), view, dtype=torch.uint8),
     )
@@ -141,13 +138,11 @@ def trace_room(
     return distance, axis, 6 * body + 2 * axis + side
 
 
-def _make_harmonics(
-    points: Float[Tensor, "n 3"], surface: Int[Tensor, "n"], degree: int, generator: torch.Generator
-) -> Float[Tensor, "n k 3"]:
-    """One colour per surface with stripes and noise; small random coefficients of higher degrees, like highlights."""
+def _paint(
+    points: Float[Tensor, "n 3"], surface: Int[Tensor, "n"], generator: torch.Generator
+) -> Float[Tensor, "n 1 3"]:
+    """Harmonics of degree 0: one colour per surface with stripes and noise."""
     palette = torch.rand(int(surface.max()) + 1, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     stripes = torch.sin(9 * points).prod(dim=1) + 0.5 * torch.sin(70 * points).prod(dim=1)
     grain = 0.05 * torch.randn(len(points), 3, generator=generator, dtype=torch.float64)
-    harmonics = 0.1 * torch.randn(len(points), (degree + 1) ** 2, 3, generator=generator)
-    harmonics[:, 0] = (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()
-    return harmonics
+    return (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()[:, None]

@@ -178,24 +178,6 @@ def _render_exact(scene: Scene, pose: Tensor, cases: Sequence[ViewerCase]) -> di
     }
 
 
-def list_findings(rows: Sequence[Row]) -> list[str]:
-    """Sentences that compare the fastest frames of renderers and modes."""
-    sentences = []
-    for count in dict.fromkeys(row.get("num_gaussians") for row in rows):
-        of_scene = [row for row in rows if row.get("num_gaussians") == count]
-        best = {tuple(map(row.get, ("renderer", "view", "mode"))): row.get("best_ms") for row in of_scene}
-        cpu, gl, parts = *(best.get((name, "perspective", "joint")) for name in RENDERERS), []
-        if cpu and gl:
-            parts.append(f"cpu draws a frame in {cpu:.0f} ms, OpenGL in {gl:.0f} ms")
-        if cpu and (deferred := best.get(("cpu", "perspective", "deferred"))):
-            parts.append(f"deferred blending takes {deferred / cpu:.2f} times as long as joint")
-        if turning := best.get(("cpu", "look-around", "deferred")):
-            parts.append(f"look-around has {1000 / turning:.0f} frames per second")
-        if parts:
-            sentences.append(f"{count:,} Gaussians: {'; '.join(parts)}.")
-    return sentences
-
-
 def plot_viewer(rows: Sequence[Row], header: Header) -> Figure:
     """Plot the time of a frame over the number of Gaussians, for each view, renderer and mode."""
     from matplotlib.ticker import NullFormatter
@@ -240,5 +222,4 @@ VIEWER = Suite(
     ),
     lambda row: f"{row.get('num_gaussians'):,} Gaussians ({row.get('scene')})",
     plot_viewer,
-    list_findings,
 )

@@ -53,7 +53,7 @@ class Batch(Computation):
     """
 
     path: Positional[Path]
-    """A folder whose subfolders hold panoramas, or a manifest (.json)."""
+    """A folder whose subfolders hold panoramas."""
     out: Out
     """Folder for the results and the report, report.jsonl."""
     do: str = "predict"
@@ -166,23 +166,17 @@ class Batch(Computation):
 
 
 def list_items(path: Path) -> dict[str, Path]:
-    """The folders with panoramas at or below a folder, or those of a manifest, by the names of their outputs."""
+    """The folders with panoramas at or below a folder, by the names of their outputs."""
     from pansplat.inputs.folders import find_panorama_folders
-    from pansplat.system.strict_json import read_json
 
     path = expand_home(path).absolute()
-    top = path if path.is_dir() else path.parent
     try:
-        listed = find_panorama_folders(path) if top == path else read_json(path, dict[str, list[str]]).get("items", [])
+        folders = find_panorama_folders(path)
     except OSError as error:
-        raise InputError(
-            f"{error.filename or path}: needed a readable folder, got '{error.strerror}'; check its permissions."
-        ) from error
-    if not listed:
+        raise InputError(f"{error.filename or path}: needed a readable folder, got '{error.strerror}'.") from error
+    if not folders:
         raise InputError(f"{path}: needed folders with panoramas, got none; check it (docs/batch.md).")
-    folders = [Path(os.path.normpath(top / expand_home(name))) for name in listed]
-    inside = {f: f.relative_to(top if f.is_relative_to(top) else f.anchor).as_posix() for f in folders}
-    return {f.name if name == "." else name: f for f, name in inside.items()}
+    return {folder.name if folder == path else folder.relative_to(path).as_posix(): folder for folder in folders}
 
 
 @with_device

@@ -16,16 +16,14 @@ from pansplat.cli.evaluate import LpipsChoice, choose_lpips
 from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
-from pansplat.system.files import is_scene_file, require_output_folder, require_replaceable
+from pansplat.system.files import require_output_folder, require_replaceable
 from pansplat.system.options import CAMERA_HEIGHT, Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from pansplat.bench.harness import Suite
-    from pansplat.bench.raster import BenchScene
     from pansplat.evaluation.results import Row
-    from pansplat.inputs.pairs import Pair
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
 _MIN_SWEEP_HEIGHT = 64  # pixels
@@ -37,10 +35,8 @@ _WindowSide = Annotated[int, Meta(ge=64, le=8192)]
 class _Options(Writer):
     """Options of every benchmark."""
 
-    json: Path | None = None
-    """File for the rows; written after every row."""
     out: OptionalOut = None
-    """Folder for NAME.json, NAME.md and NAME.png, with the name of the benchmark."""
+    """Folder for NAME.json, NAME.md and NAME.png, with the name of the benchmark; rows are written as they come."""
     threads: Threads | None = None
     """The largest number of threads to use; by default torch's."""
 
@@ -48,14 +44,11 @@ class _Options(Writer):
         """Refuse files and folders that cannot be written; set the number of threads, and return it."""
         import torch
 
-        require_replaceable("--json", filter(None, [self.json]), self.overwrite)
         if self.out is not None:
             require_output_folder("--out", self.out)
             files = [self.out / f"{name}{suffix}" for suffix in (".json", ".md", ".png")]
             require_replaceable("--out", files, self.overwrite)
             self.out.mkdir(parents=True, exist_ok=True)
-        if self.json is not None and not self.json.resolve().parent.is_dir():
-            raise InputError(f"cannot write {self.json}: its folder does not exist; create it first")
         if self.threads is not None:
             torch.set_num_threads(self.threads)
         return torch.get_num_threads()
@@ -64,17 +57,15 @@ class _Options(Writer):
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
         from pansplat.bench.harness import run
 
-        return run(suite, rows, header, self.json, self.out)
+        return run(suite, rows, header, self.out)
 
 
 @dataclass(frozen=True)
 class BenchRaster(_Options):
-    """Measure the rasterisers: time and memory against error, for every kernel and layout."""
+    """Measure the rasterisers: time and memory against error, for panoramas, cube faces and the official drawing."""
 
-    scene: Positional[Path | None] = None
-    """A scene file, or the folder of a pair for `sweep`; by default a synthetic room, and the sample if it is there."""
     quick: bool = False
-    """Some minutes on two cores instead of an hour: all choices at reduced height only."""
+    """Fewer repeats, and cube faces and the official drawing at reduced height only."""
     height: Annotated[int, Meta(ge=16, le=8192, multiple_of=8)] = 512
     """Height of the panoramas, pixels; a multiple of 8."""
 
@@ -86,31 +77,17 @@ class BenchRaster(_Options):
 
         threads, small = self._check("raster"), raster.choice_height(self.height, quick=self.quick)
         backends = ["numba", "triton"] if torch.cuda.is_available() else ["numba"]
-        whole = None if self.scene is None else self._open_scene(self.scene, self.height)
         if len(backends) == 1:
             print("without triton: there is no CUDA device")
-        scene_of = raster.make_room_scene if whole is None else lambda height: whole
-        groups = raster.list_raster_groups(scene_of, self.height, backends, threads, quick=self.quick)
-        if whole is None and _SAMPLE.is_dir():
-            groups.append(raster.make_sample_group(self._open_scene(_SAMPLE, small), small, backends, threads))
+        groups = raster.list_raster_groups(self.height, backends, threads, quick=self.quick)
+        if _SAMPLE.is_dir():
+            options = PredictOptions("sweep", height=max(small, _MIN_SWEEP_HEIGHT), refine_seconds=0.0)
+            scene = predict_scene(choose_pair(_SAMPLE, PairChoice()), options)
+            sample = raster.BenchScene(_SAMPLE.stem, lambda: scene.gaussians, scene.pose_between(0.5))
+            groups.append(raster.make_sample_group(sample, small, backends, threads))
         budget, slow = (1.0, 3.0) if self.quick else (8.0, 5.0)
         self._run(raster.RASTER, raster.measure_raster(groups, budget=budget, slow=slow))
         return 0
-
-    def _open_scene(self, path: Path, height: int) -> BenchScene:
-        """The scene of a file or a pair, seen from between its cameras, or from the origin if it has none."""
-        import torch
-
-        from pansplat import pipeline
-        from pansplat.bench.raster import BenchScene
-
-        if is_scene_file(path):
-            scene = pipeline.load(path)
-        else:
-            options = PredictOptions("sweep", height=max(height, _MIN_SWEEP_HEIGHT), refine_seconds=0.0)
-            scene = predict_scene(choose_pair(path, PairChoice()), options)
-        pose = scene.pose_between(0.5) if len(scene.cam2world) else torch.eye(4, dtype=torch.float64)
-        return BenchScene(path.stem, lambda: scene.gaussians, pose)
 
 
 @dataclass(frozen=True)
@@ -164,36 +141,17 @@ class BenchRefine(_Options):
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
+        from pansplat import pipeline
         from pansplat.bench.refine import REFINE, list_refine_cases, measure_refine
 
         self._check("refine")
-        pairs = _load_with_targets(self.paths)
+        found = [pair for path in _paths_or_sample(self.paths) for pair in pipeline.load_pairs(path)]
+        pairs = [pair for pair in found if pair.targets]
+        if not pairs:
+            raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
         cases = list_refine_cases(quick=self.quick)
         lpips = choose_lpips(self.lpips, min(case.height for case in cases))
         self._run(REFINE, measure_refine(pairs, cases, lpips), lpips=None if lpips is None else lpips.name)
-        return 0
-
-
-@dataclass(frozen=True)
-class BenchFlights(_Options):
-    """Measure pictures on the way between two panoramas: mixed, drawn jointly, and of each panorama alone."""
-
-    paths: Positional[tuple[Path, ...]] = ()
-    """Folders of pairs with targets, such as those of `pansplat-homes flights`; by default the sample."""
-    model: str = "default"
-    """Name of a predictor, or weights."""
-    height: Annotated[int, Meta(ge=64, le=8192, multiple_of=8)] = 512
-    """Height of the panoramas, pixels."""
-    lpips: LpipsChoice = field(default_factory=LpipsChoice)
-
-    def run(self) -> int:
-        """Measure, print the tables and write the files; an interruption keeps the measured rows."""
-        from pansplat.bench.flights import FLIGHTS, measure_flights
-
-        self._check("flights")
-        pairs, lpips = _load_with_targets(self.paths), choose_lpips(self.lpips, self.height)
-        rows, name = measure_flights(pairs, self.model, self.height, lpips), None if lpips is None else lpips.name
-        self._run(FLIGHTS, rows, lpips=name, height=self.height)
         return 0
 
 
@@ -251,7 +209,6 @@ class Bench:
         Annotated[BenchRaster, subcommand("raster")]
         | Annotated[BenchModel, subcommand("model")]
         | Annotated[BenchRefine, subcommand("refine")]
-        | Annotated[BenchFlights, subcommand("flights")]
         | Annotated[BenchViewer, subcommand("viewer")]
         | Annotated[BenchPose, subcommand("pose")]
     )
@@ -266,14 +223,3 @@ def _paths_or_sample(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     if not paths and not _SAMPLE.is_dir():
         raise InputError("give a folder (the sample is in the repository only)")
     return paths or (_SAMPLE,)
-
-
-def _load_with_targets(paths: tuple[Path, ...]) -> list[Pair]:
-    """The pairs of folders, by default of the sample, that have targets."""
-    from pansplat import pipeline
-
-    found = [pair for path in _paths_or_sample(paths) for pair in pipeline.load_pairs(path)]
-    pairs = [pair for pair in found if pair.targets]
-    if not pairs:
-        raise InputError(f"none of the {len(found)} pairs has a target view to compare with")
-    return pairs

@@ -7,13 +7,10 @@ first call that uses them.
 from __future__ import annotations
 
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from typing import TYPE_CHECKING
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 # The processes that compile import torch and the kernels, this one does not: it would take three seconds.
 if TYPE_CHECKING:
@@ -22,26 +19,19 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Compile the kernels in two processes, show the progress, and print the time."""
+    """Compile the kernels in two processes, and print the time."""
     start = time.perf_counter()
-    columns = TextColumn("compiling: {task.description}"), BarColumn(), TimeElapsedColumn()
-    with (
-        Progress(*columns, console=Console(stderr=True), transient=True) as progress,
-        ProcessPoolExecutor(len(STEPS), get_context("spawn")) as pool,
-    ):
-        tasks = {pool.submit(compile_kernels, name): progress.add_task(name, total=None) for name in STEPS}
-        for future in as_completed(tasks):
-            future.result()
-            progress.update(tasks[future], total=1, completed=1)
+    with ProcessPoolExecutor(len(STEPS), get_context("spawn")) as pool:
+        list(pool.map(compile_kernels, range(len(STEPS))))
     print(f"CPU kernels are compiled ({time.perf_counter() - start:.0f} s)")
 
 
-def compile_kernels(name: str) -> None:
-    """Compile the kernels of one of `STEPS` in this process, without a message about it."""
+def compile_kernels(group: int) -> None:
+    """Compile the kernels of a group of `STEPS` in this process, without a message about it."""
     from pansplat.rendering.cpu.runtime import hide_message
 
     hide_message()
-    for step in STEPS[name]:
+    for step in STEPS[group]:
         step()
 
 
@@ -123,17 +113,17 @@ def _predict() -> None:
 
 
 # Few kernels are in both; the first process that compiles one writes it to numba's cache for the other.
-STEPS = {
-    "sweep and depth network": (_predict,),
-    "rasteriser and viewer": (
+STEPS = (
+    (_predict,),
+    (
         partial(_rasterize, 0, "equirect"),
         partial(_rasterize, 1, "pinhole"),
         _compare,
         _rasterize_stereo,
         _draw_display_image,
     ),
-}
-"""Calls that compile kernels, by the name of the group; each group has a process."""
+)
+"""Groups of calls that compile kernels, of the sweep and of rasteriser and viewer; each group has a process."""
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Image and depth metrics, and the cross-fade baseline.
+"""Image metrics, and the cross-fade baseline.
 
 Images are RGB; only PSNR clamps them to [0, 1]. Masks are True where a pixel counts.
 
@@ -14,7 +14,6 @@ import scipy
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional
 
 from pansplat.geometry.equirect import rotate_equirect, row_weights
 from pansplat.geometry.pose import blend_weights
@@ -100,32 +99,6 @@ def _check_shapes(prediction: Tensor, target: Tensor, mask: Tensor | None) -> No
         raise ValueError(f"`prediction` and `target` must both be (3, height, width), got {shapes}")
     if mask is not None and mask.shape != target.shape[1:]:
         raise ValueError(f"`mask` must be {tuple(target.shape[1:])}, got {tuple(mask.shape)}")
-
-
-def depth_errors(
-    depth: Float[Tensor, "view h w"], true_depth: Float[Tensor, "view height width"], near: float, far: float
-) -> dict[str, float]:
-    """Errors over the pixels whose true depth is strictly between `near` and `far`; empty if there are none.
-
-    `abs_rel` is the mean of |error| / truth, `sq_rel` that of error^2 / truth in metres, and `rmse` the root of the
-    mean of error^2 in metres.
-
-    Args:
-        depth: radial, metres; resized to the truth bilinearly, without wrapping.
-        true_depth: radial, metres, 0 where unknown.
-    """
-    size = true_depth.shape[-2:]
-    large = functional.interpolate(depth[:, None].double(), size, mode="bilinear", align_corners=False)[:, 0]
-    known = (true_depth > near) & (true_depth < far)
-    if not known.any():
-        return {}
-    truth = true_depth[known].double()
-    error = large.to(truth)[known] - truth
-    return {
-        "abs_rel": float((error.abs() / truth).mean()),
-        "sq_rel": float((error.square() / truth).mean()),
-        "rmse": math.sqrt(float(error.square().mean())),
-    }
 
 
 def cross_fade(

@@ -59,32 +59,28 @@ class Column:
     """A column of a table.
 
     Attributes:
-        title: of one line, or of two: neighbours with the same first line share it.
+        title: for people.
         value: name of an entry of the row, or a function of the row.
         form: format of a value. Columns without it hold texts and are aligned on the left.
-        missing: text of a cell whose value was not measured.
     """
 
     title: str
     value: str | Callable[[Row], Any]
     form: str = ""
-    missing: str = ""
 
     def cell(self, row: Row) -> str:
-        """The text of a row's cell, "exact" for an infinite PSNR."""
+        """The text of a row's cell: empty if nothing was measured, "exact" for an infinite PSNR."""
         value = row.get(self.value) if isinstance(self.value, str) else self.value(row)
         if value is None:
-            return self.missing
+            return ""
         return "exact" if value == math.inf else str(value) if isinstance(value, str) else format(value, self.form)
 
 
 def rich_table(title: str, columns: Sequence[Column], rows: Sequence[Row], below: Sequence[Row] = ()) -> Table:
     """A printable table. The rows `below` follow a line, in bold. Only columns without a title may wrap."""
-    table, shared = Table(title=title, title_justify="left", pad_edge=False), ""
+    table = Table(title=title, title_justify="left", pad_edge=False)
     for column in columns:
-        above, line, head = column.title.rpartition("\n")
-        head, shared = (line + head if above == shared else column.title), above
-        table.add_column(head, justify="right" if column.form else "left", no_wrap=bool(head))
+        table.add_column(column.title, justify="right" if column.form else "left", no_wrap=bool(column.title))
     for row in rows:
         table.add_row(*(column.cell(row) for column in columns))
     table.add_section()
@@ -93,12 +89,11 @@ def rich_table(title: str, columns: Sequence[Column], rows: Sequence[Row], below
     return table
 
 
-def markdown_table(title: str, columns: Sequence[Column], rows: Sequence[Row], below: Sequence[Row] = ()) -> str:
-    """A heading and a table in Markdown, the rows `below` in bold."""
-    cells = [[column.title.replace("\n", " ") for column in columns]]
+def markdown_table(title: str, columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    """A heading and a table in Markdown."""
+    cells = [[column.title for column in columns]]
     cells += [["---:" if column.form else "---" for column in columns]]
     cells += [[column.cell(row) for column in columns] for row in rows]
-    cells += [[f"**{column.cell(row)}**" for column in columns] for row in below]
     return "\n".join([f"### {title[:1].upper()}{title[1:]}", "", *(f"| {' | '.join(line)} |" for line in cells)]) + "\n"
 
 

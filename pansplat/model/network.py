@@ -96,44 +96,23 @@ class NetworkPredictor:
         """
         if images.ndim == 5:
             return [
-                self.predict_with_depths(
+                self._predict(
                     images[n],
                     cam2world[n],
                     select_item(near, n),
                     select_item(far, n),
-                    masks=None if masks is None else masks[n],
-                )[0]
+                    None if masks is None else masks[n],
+                )
                 for n in range(len(images))
             ]
-        return self.predict_with_depths(images, cam2world, near, far, masks=masks)[0]
+        return self._predict(images, cam2world, near, far, masks)
 
-    @torch.no_grad()
-    def predict_with_depths(
-        self,
-        images: Float[Tensor, "view 3 height width"],
-        cam2world: Float[Tensor, "view 4 4"],
-        near: float | Tensor,
-        far: float | Tensor,
-        *,
-        masks: Bool[Tensor, "view height width"] | None = None,
-    ) -> tuple[Gaussians, list[Float[Tensor, "view _ _"]]]:
-        """Predict Gaussians like `__call__`, and the radial depth maps of the swept levels, metres, coarse to fine."""
-        tiles = first = self.tiles or choose_tiles(images.shape[-2])
-        while True:
-            try:
-                matched = self._match(images, cam2world, near, far, masks, tiles)
-                parts = list(self._lift(matched, tiles))
-                break
-            except torch.cuda.OutOfMemoryError:  # of a graphics card only
-                tiles *= 2
-            if tiles > 4 * first:
-                self.network.cpu()
-                tiles = first
-            note_full_card(self.name, f"{tiles}x{tiles} tiles" if tiles > first else "it runs on the processor")
-        gaussians = merge_tiles(parts, self.network.compat)[0].to(device=images.device)
-        if masks is not None:
-            gaussians = remove_masked_gaussians(gaussians, cam2world, masks)
-        return gaussians, [depth[0].to(images.device) for depth in matched.depths.depth]
+    def _predict(
+        self, images: Tensor, cam2world: Tensor, near: float | Tensor, far: float | Tensor, masks: Tensor | None
+    ) -> Gaussians:
+        parts = list(self._list_parts(images, cam2world, near, far, masks))
+        gaussians = merge_tiles(parts, self.network.compat)[0]
+        return gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
 
     def stream(
         self,
@@ -144,12 +123,20 @@ class NetworkPredictor:
         *,
         masks: Bool[Tensor, "view height width"] | None = None,
     ) -> Iterator[Gaussians]:
-        """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part.
+        """Yield the Gaussians of `__call__` tile by tile, in bounded memory; errors are raised at the first part."""
+        for part in self._list_parts(images, cam2world, near, far, masks):
+            (gaussians,) = part.gaussians
+            yield gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
 
-        Out of a card's memory the processor makes the parts that are left.
+    def _list_parts(
+        self, images: Tensor, cam2world: Tensor, near: float | Tensor, far: float | Tensor, masks: Tensor | None
+    ) -> Iterator[TileGaussians]:
+        """Yield the Gaussians of one item tile by tile.
+
+        Out of a card's memory there are more tiles if none was made, then the processor makes those that are left.
         """
-        tiles, done = self.tiles or choose_tiles(images.shape[-2]), 0
-        parts: Iterator[TileGaussians] | None = None
+        tiles = first = self.tiles or choose_tiles(images.shape[-2])
+        done, parts = 0, None
         while True:
             with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
                 try:
@@ -157,17 +144,20 @@ class NetworkPredictor:
                         matched = self._match(images, cam2world, near, far, masks, tiles)
                         parts = itertools.islice(self._lift(matched, tiles), done, None)
                     part = next(parts, None)
-                except torch.cuda.OutOfMemoryError:
-                    note_full_card(self.name)
-                    self.network.cpu()
-                    parts = None
+                except torch.cuda.OutOfMemoryError:  # of a graphics card only
+                    matched = parts = None  # frees the maps on the card
+                    if done == 0 and tiles < 4 * first:
+                        tiles *= 2
+                        note_full_card(self.name, f"{tiles}x{tiles} tiles")
+                    else:
+                        tiles = tiles if done else first
+                        note_full_card(self.name)
+                        self.network.cpu()
                     continue
-                if part is None:
-                    return
-                done += 1
-                gaussians = part.gaussians[0].to(device=images.device)
-                gaussians = gaussians if masks is None else remove_masked_gaussians(gaussians, cam2world, masks)
-            yield gaussians
+            if part is None:
+                return
+            done += 1
+            yield TileGaussians([part.gaussians[0].to(device=images.device)], part.index)
 
     def _match(
         self,
@@ -253,11 +243,7 @@ def load_predictor(
     path, device = Path(path), choose_device("network")
     if device.type == "cpu" or precision not in get_args(Precision):
         require_precision(precision)
-    weights = (
-        convert_checkpoint(read_checkpoint(path), path)
-        if path.suffix.lower() in CHECKPOINT_SUFFIXES
-        else load_weights(path)
-    )
+    weights = read_weights(path)
     network = build_network(
         weights,
         weights.compat if compat == "trained" else compat,
@@ -266,6 +252,12 @@ def load_predictor(
         attention_precision=attention_precision,
     )
     return NetworkPredictor(weights.model, network.to(device))
+
+
+def read_weights(path: Path) -> WeightsFile:
+    """The content of a weights file, or that of an official checkpoint, converted."""
+    is_official = path.suffix.lower() in CHECKPOINT_SUFFIXES
+    return convert_checkpoint(read_checkpoint(path), path) if is_official else load_weights(path)
 
 
 def convert_checkpoint(content: Mapping[str, object], source: object) -> WeightsFile:

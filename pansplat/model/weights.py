@@ -242,36 +242,6 @@ def _suggest_remedy(path: Path) -> str:
     return "download or copy it again"
 
 
-@dataclass(frozen=True)
-class ConversionReport:
-    """How the tensors of an official checkpoint are converted.
-
-    Attributes:
-        used: our name of each tensor that is used, by official name.
-        unused: official names of tensors that are not used, by reason.
-        unexpected: names that are not official.
-        missing: official names that the checkpoint lacks.
-    """
-
-    used: dict[str, str]
-    unused: dict[str, list[str]]
-    unexpected: list[str]
-    missing: list[str]
-
-    def require_complete(self, source: object) -> None:
-        """Raise an InputError that counts and names the tensors that are missing or unexpected."""
-        problems = []
-        if self.missing:
-            problems.append(f"lacked {_join_names(self.missing)}")
-        if self.unexpected:
-            problems.append(f"found unknown {_join_names(self.unexpected)}")
-        if problems:
-            raise InputError(
-                f"{source}: needed exactly the tensors of the official PanSplat, {' and '.join(problems)}; "
-                "use the checkpoint of an unmodified model"
-            )
-
-
 def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, Tensor]:
     """Convert the tensors of an official checkpoint to our names, and floating-point numbers to float32.
 
@@ -279,40 +249,43 @@ def convert_tensors(content: Mapping[str, object], source: object) -> dict[str, 
         content: result of `read_checkpoint`.
         source: the file, for messages.
     """
-    report = match_tensors(content, source)
-    report.require_complete(source)
-    state = get_state_dict(content, str(source))
+    match_tensors(content, source)
+    state, names = get_state_dict(content, str(source)), map_official_names()
     _require_official_grids(state, source)
-    tensors = {}
-    for name, ours in map_official_names().items():
-        tensor = state[_PREFIX + name]
-        tensor = tensor.squeeze(-1) if tensor.ndim == 3 else tensor  # 1-D convolutions are linear layers here
-        if tensor.is_floating_point():
-            tensor = tensor.float()
-            if not torch.isfinite(tensor).all():
-                raise InputError(f"{source}: needed finite numbers, got NaN or infinity in {name}; use another file")
-        tensors[ours] = tensor
-    return tensors
+    official = as_float32({name: state[_PREFIX + name] for name in names}, source)
+    # 1-D convolutions are linear layers here.
+    return {ours: t.squeeze(-1) if (t := official[name]).ndim == 3 else t for name, ours in names.items()}
 
 
-def match_tensors(content: Mapping[str, object], source: object) -> ConversionReport:
-    """Match the tensors of an official checkpoint with ours; an InputError if they are of another network."""
+def match_tensors(content: Mapping[str, object], source: object) -> dict[str, list[str]]:
+    """Names of the tensors and entries of an official checkpoint that are not used, by reason.
+
+    Raises:
+        InputError: the checkpoint is that of another network, or tensors are missing or unknown.
+    """
     state = get_state_dict(content, str(source))
     _require_pansplat(state, source)
-    expected = {_PREFIX + name: ours for name, ours in map_official_names().items()}
+    used = {_PREFIX + name for name in map_official_names()}
     grids = {_PREFIX + name for name in _GRID_HEIGHTS}
     auxiliary = {_AUXILIARY_PREFIX + name for name in _list_auxiliary_names()}
+    missing = sorted((used | grids) - state.keys())
+    unknown = [name for name in state if name not in used | grids | auxiliary]
+    problems = [
+        f"{problem} {_join_names(names)}"
+        for problem, names in (("lacked", missing), ("found unknown", unknown))
+        if names
+    ]
+    if problems:
+        raise InputError(
+            f"{source}: needed exactly the tensors of the official PanSplat, {' and '.join(problems)}; "
+            "use the checkpoint of an unmodified model"
+        )
     unused = {
-        "recomputed grids": sorted(grids & state.keys()),
+        "recomputed grids": sorted(grids),
         "auxiliary heads, for training only": sorted(auxiliary & state.keys()),
         "training state": sorted(key for key in content if key != "state_dict"),
     }
-    return ConversionReport(
-        used={name: ours for name, ours in expected.items() if name in state},
-        unused={reason: names for reason, names in unused.items() if names},
-        unexpected=[name for name in state if name not in expected.keys() | grids | auxiliary],
-        missing=[name for name in (*expected, *sorted(grids)) if name not in state],
-    )
+    return {reason: names for reason, names in unused.items() if names}
 
 
 def map_official_names() -> dict[str, str]:

@@ -102,6 +102,8 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
     """
     try:
         return msgspec.convert(value, kind, strict=strict)
+    except UnicodeEncodeError as error:
+        raise InputError(f"{source}: needed valid Unicode, got {error.object!a:.{_SHOWN}}; correct it.") from error
     except msgspec.ValidationError as error:
         found = re.fullmatch(r"(.*?)(?: - at (?:`key` in )?`\$(.*)`)?", str(error), re.DOTALL)
         problem, path = found[1], found[2] or ""

@@ -16,10 +16,9 @@ import torch
 from msgspec import Meta, Struct
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.model.layers import Compat
-from pansplat.model.weights import UnsafeCheckpointError, WeightsFile, as_float32, read_checkpoint
+from pansplat.model.weights import UnsafeCheckpointError, read_checkpoint
 from pansplat.system.atomic import replacing
-from pansplat.system.strict_json import convert, parse_json
+from pansplat.system.strict_json import convert
 
 _KIND, _FORMAT = "pansplat-training", 1
 _NAME = re.compile(r"step_(\d{8})\.pt")
@@ -31,7 +30,6 @@ class _Content(Struct):
 
     step: Annotated[int, Meta(ge=0, lt=10**9)] = 0
     config: str = ""
-    weights: str = ""
     network: _Tensors = {}
     auxiliary: _Tensors | None = None
     mean: _Tensors | None = None
@@ -60,14 +58,6 @@ def list_checkpoints(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name))
-
-
-class _Weights(Struct):
-    """What a checkpoint states of its network."""
-
-    model: str
-    config: dict[str, Any]
-    compat: Compat
 
 
 class DamagedCheckpointError(InputError):
@@ -129,8 +119,8 @@ def load_latest(
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Content of a training checkpoint; an InputError if it is damaged, of another kind or format, or has code."""
     content = read_checkpoint(path)
-    if not is_training_state(content):
-        raise InputError(f"{path}: needed a checkpoint of pansplat-train, got another file; give it as --network.init.")
+    if content.get("kind") != _KIND:
+        raise InputError(f"{path}: needed a checkpoint of pansplat-train, got another file.")
     if not isinstance(content.get("format"), int) or content["format"] != _FORMAT:
         raise InputError(
             f"{path}: needed format {_FORMAT} of training checkpoints, got {content.get('format')!s:.20}; use the "
@@ -147,19 +137,3 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -
         for name in ("exp_avg", "exp_avg_sq"):
             if values[name].shape != parameter.shape:
                 raise ValueError(f"{name} has the shape {tuple(values[name].shape)}")
-
-
-def is_training_state(content: Mapping[str, Any]) -> bool:
-    """Whether the content of a file is that of a training checkpoint."""
-    kind = content.get("kind")
-    return isinstance(kind, str) and kind == _KIND
-
-
-def extract_weights(content: Mapping[str, Any], path: Path) -> WeightsFile:
-    """The weights of a training checkpoint, their moving average if there is one; an InputError if invalid."""
-    try:
-        header = convert(parse_json(content["weights"], f"{path}: weights"), _Weights, f"{path}: weights")
-        tensors = content["mean"] if content.get("mean") else content["network"]
-        return WeightsFile(header.model, header.config, header.compat, as_float32(tensors, path))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: needed weights in the checkpoint, got {error!r}; use another file.") from error

@@ -14,14 +14,13 @@ from pansplat.errors import InputError
 from pansplat.model.layers import Compat, Precision
 from pansplat.system.options import Count, CountOrNone, Fraction, Minutes, Seed, check_numbers
 from pansplat.system.strict_json import convert, parse_json
-from pansplat.training.augment import Augmentation
 from pansplat.training.losses import CODE, LossWeights, PerceptualName
 
 DataKind = Literal["room", "panogrf", "360loc", "pairs", "triplets"]
 NetworkShape = Literal["paper", "small", "tiny"]
 Part = Literal["features", "cost_volume", "heads"]
 Backpropagation = Literal["plain", "one-step", "two-step"]
-Style = Literal["panorama", "cubemap", "original"]
+Style = Literal["panorama", "cubemap"]
 Mixing = Literal["joint", "by_view"]
 
 
@@ -42,8 +41,8 @@ class DataConfig:
     """Frames between the inputs: uniformly random, or always the smallest gap, as in the official code."""
     workers: Annotated[int, Meta(ge=0, le=256)] = 2
     """Processes that read data; 0 to read in the training process."""
-    augmentation: Augmentation | None = field(default_factory=Augmentation)
-    """Random changes of samples; the official code has none."""
+    augmentation: bool = True
+    """Random yaw, mirroring and colours of samples; the official code has none."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class NetworkConfig:
     attention_precision: Precision = "float32"
     """Number type to which the inputs of attention are rounded."""
     init: Path | None = None
-    """Initial weights: a .safetensors, an official .ckpt, or a checkpoint of pansplat-train."""
+    """Initial weights: a .safetensors of `pansplat convert` or of training, or an official .ckpt."""
     frozen: tuple[Part, ...] = ()
     """Parts that are not trained; their normalisation statistics do not change either."""
     auxiliary: bool = False
@@ -75,7 +74,7 @@ class MemoryConfig:
     tiles: Annotated[int, Meta(ge=1, le=64)] = 1
     """Number of tiles along each side of the panorama."""
     style: Style = "panorama"
-    """panorama: one ray per pixel. cubemap: six cube faces. original: six cube faces as in the official code."""
+    """panorama: one ray per pixel. cubemap: six cube faces."""
     mixing: Mixing = "joint"
     """joint: all views' Gaussians in one image. by_view: one image per view, blended by distance."""
 
@@ -86,9 +85,7 @@ class OptimizerConfig:
 
     steps: Count = 1000
     batch_size: Annotated[int, Meta(ge=1, le=4096)] = 2
-    """Samples per step and round of accumulation."""
-    accumulate: Annotated[int, Meta(ge=1, le=4096)] = 1
-    """Rounds of gradient accumulation per step."""
+    """Samples per step."""
     rate: Annotated[float, Meta(gt=0, le=1e3)] = 2e-4
     """Peak learning rate of Adam."""
     clip: Annotated[float, Meta(gt=0)] = 0.5
@@ -201,7 +198,7 @@ def _differences(old: object, new: object, name: str = "") -> list[str]:
 
 _TRIPLETS = 19_950  # of Matterport3D
 _SEQUENCES = 13  # of 360Loc
-_MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=None)
+_MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=False)
 _PLAIN = MemoryConfig(style="cubemap")
 _TILED_2X2 = MemoryConfig("two-step", 2, "cubemap")
 _TILED_4X4 = MemoryConfig("two-step", 4, "cubemap")
@@ -239,7 +236,7 @@ def _loc360_preset(
         heights=(height,),
         perceptual="lpips-vgg",
         loss=_WITHOUT_DEPTH,
-        data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=None, training_gap="original"),
+        data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=False, training_gap="original"),
         network=network,
         memory=replace(memory, mixing="by_view"),
         optimizer=OptimizerConfig(steps=max(1, epochs * steps_per_epoch), batch_size=batch),

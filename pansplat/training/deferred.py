@@ -83,9 +83,8 @@ def backpropagate(
     method: Literal["one-step", "two-step"],
     tiles: int = 1,
     matching_is_trainable: bool = True,
-    weight: float = 1.0,
 ) -> tuple[Float[Tensor, ""], LossTerms]:
-    """Add `weight` times the gradient of the loss to the parameters' gradients.
+    """Add the gradient of the loss to the parameters' gradients.
 
     Args:
         tiles: number of tiles along each side of the panorama.
@@ -101,14 +100,14 @@ def backpropagate(
         loss, terms = problem.image_loss(
             renderer.render_batch(merge_tiles(tiled, network.compat), problem.targets, problem.cam2world)
         )
-        (weight * loss).backward()
+        loss.backward()
     else:
         ordered = network.compat == "fixed"
         scenes = [TiledGaussians(tiled, item, ordered=ordered) for item in range(len(problem.images))]
-        loss, terms = _backpropagate_parts(scenes, problem, renderer, weight)
+        loss, terms = _backpropagate_parts(scenes, problem, renderer)
     match_loss, match_terms = problem.match_loss(maps.leaves)
     if match_loss is not None and match_loss.requires_grad:
-        (weight * match_loss).backward()
+        match_loss.backward()
     for number, tile in enumerate(tiled):
         for item, view in itertools.product(*map(range, problem.images.shape[:2])):
             gaussians = _lift_tile(network, maps.leaves, item, view, tiles, number)
@@ -139,7 +138,7 @@ class _PartwiseImage:
 
 
 def _backpropagate_parts(
-    scenes: list[TiledGaussians], problem: Problem, renderer: TargetRenderer, weight: float
+    scenes: list[TiledGaussians], problem: Problem, renderer: TargetRenderer
 ) -> tuple[Tensor, LossTerms]:
     """Add the image loss's gradient to the Gaussians' gradients, with the graph of one part at a time."""
     images = []
@@ -157,7 +156,7 @@ def _backpropagate_parts(
             )
     for part in (part for parts in rendered for part in parts):
         part.requires_grad_()
-    loss, terms = _backpropagate_image_loss(rendered, images, problem, renderer, weight)
+    loss, terms = _backpropagate_image_loss(rendered, images, problem, renderer)
     for parts, image in zip(rendered, images, strict=True):
         for leaf, part, rows in zip(parts, image.parts, image.rows, strict=True):
             gaussians = Cut(image.scene.select(rows), everything=True).leaves
@@ -174,14 +173,13 @@ def _backpropagate_image_loss(
     images: list[_PartwiseImage],
     problem: Problem,
     renderer: TargetRenderer,
-    weight: float,
 ) -> tuple[Float[Tensor, ""], LossTerms]:
     """Backpropagate the image loss to the rendered parts. The graph is freed on return."""
     composed = [
         renderer.compose(parts, image.pose, image.context) for parts, image in zip(rendered, images, strict=True)
     ]
     loss, terms = problem.image_loss(torch.stack(composed).unflatten(0, problem.targets.shape[:2]))
-    (weight * loss).backward()
+    loss.backward()
     return loss.detach(), terms
 
 

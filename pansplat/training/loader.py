@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from pansplat.errors import InputError
 from pansplat.inputs.views import Batch, Sample, collate
-from pansplat.training.augment import Augmentation, augment
+from pansplat.training.augment import augment
 from pansplat.training.sources import SampleSource
 
 _MAX_FAILURES = 32  # consecutive unreadable samples before an error
@@ -45,7 +45,7 @@ class Loader:
         batch_size: samples per batch.
         seed: seed of the order and of the samples' random numbers.
         workers: processes that read; 0 to read in this process.
-        augmentation: None for no augmentation.
+        augmentation: whether samples are changed at random.
 
     Attributes:
         skipped: by message, the number of times that an unreadable sample was skipped. The first time it warns.
@@ -59,7 +59,7 @@ class Loader:
         batch_size: int,
         seed: int = 0,
         workers: int = 0,
-        augmentation: Augmentation | None = None,
+        augmentation: bool = False,
     ) -> None:
         if len(source) == 0:
             raise InputError("needed at least one sample, got an empty source; give other data.")
@@ -117,7 +117,7 @@ def _ignore_interrupts(_: int) -> None:
 class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
     """The sample at a position of the infinite sequence of epochs, and the samples that were skipped for it."""
 
-    def __init__(self, source: SampleSource, height: int, seed: int, augmentation: Augmentation | None) -> None:
+    def __init__(self, source: SampleSource, height: int, seed: int, augmentation: bool) -> None:
         self.source, self.height, self.seed, self.augmentation = source, height, seed, augmentation
 
     def __getitem__(self, position: int) -> tuple[Sample | None, list[Skipped]]:
@@ -137,9 +137,7 @@ class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
         """The sample at an index. The seed includes `place`, so that two reads of a sample in one epoch differ."""
         seeds = np.random.SeedSequence((self.seed, epoch, index, place)).spawn(2)
         sample = self.source.sample(index, self.height, int(seeds[0].generate_state(1)[0]))
-        if self.augmentation is None:
-            return sample
-        return augment(sample, self.augmentation, np.random.default_rng(seeds[1]))
+        return augment(sample, np.random.default_rng(seeds[1])) if self.augmentation else sample
 
 
 @lru_cache(maxsize=4)

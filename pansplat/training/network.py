@@ -12,18 +12,9 @@ from pansplat.errors import InputError
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import AdapterConfig, AuxiliaryHeads, HeadsConfig
-from pansplat.model.network import convert_checkpoint, require_precision
+from pansplat.model.network import read_weights, require_precision
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.weights import (
-    CHECKPOINT_SUFFIXES,
-    WeightsFile,
-    load_weights,
-    pack_weights,
-    read_checkpoint,
-    require_shapes,
-    save_weights,
-)
-from pansplat.training.checkpoint import extract_weights, is_training_state
+from pansplat.model.weights import pack_weights, require_shapes, save_weights
 from pansplat.training.config import NetworkConfig, NetworkShape
 
 
@@ -70,14 +61,6 @@ def build_network(config: NetworkConfig, seed: int) -> PanSplat:
         )
     freeze(network, config.frozen)
     return network
-
-
-def read_weights(path: Path) -> WeightsFile:
-    """Weights of a .safetensors, an official or a training checkpoint; an InputError if it is unusable."""
-    if path.suffix.lower() not in CHECKPOINT_SUFFIXES:
-        return load_weights(path)
-    content = read_checkpoint(path)
-    return extract_weights(content, path) if is_training_state(content) else convert_checkpoint(content, path)
 
 
 def write_weights(path: Path, network: PanSplat, state: dict[str, torch.Tensor] | None = None) -> None:

@@ -22,13 +22,14 @@ from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.pose import blend_weights
 from pansplat.rendering.blend import blend
 from pansplat.rendering.image_planes import ImagePlane, image_planes, stitch_faces
-from pansplat.rendering.official import official_face_size, official_gaussians
-from pansplat.rendering.projection import ProjectedGaussians, compute_footprints, is_in_image, project_gaussians
+from pansplat.rendering.official import official_face_size
+from pansplat.rendering.projection import compute_footprints, is_in_image, project_gaussians
 from pansplat.rendering.rasterize import RasterOptions, Rendering, rasterize
 from pansplat.training.config import Mixing, Style
 
 _FACES = 6
 _STRIPS = 6  # of equal area on the sphere
+_OPTIONS = RasterOptions()
 _CHUNK = 1 << 16  # Gaussians per visibility test, because their geometry is float64
 
 
@@ -76,7 +77,7 @@ class TargetRenderer:
         self, gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], parts: Sequence[ImagePart]
     ) -> list[Bool[Tensor, "n"]]:
         """A mask for each part: the Gaussians that `render_part` needs."""
-        masks = find_visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device), self._options)
+        masks = find_visible_gaussians(gaussians, cam2world, self._regions(gaussians.means.device))
         return [
             masks[part.index] if part.view is None else masks[part.index] & (gaussians.views == part.view)
             for part in parts
@@ -92,7 +93,10 @@ class TargetRenderer:
             context: poses of the input views, for the blend weights.
         """
         panoramas = [
-            self._render_panorama(self._select(gaussians, view), cam2world) for view in self._view_choices(len(context))
+            self._render_panorama(
+                gaussians if view is None else gaussians.select((gaussians.views == view).nonzero()[:, 0]), cam2world
+            )
+            for view in self._view_choices(len(context))
         ]
         return self._blend(panoramas, cam2world, context)
 
@@ -121,9 +125,7 @@ class TargetRenderer:
             image = self._render_panorama(gaussians, cam2world)
             return torch.cat((image.color, image.alpha[None]))[:, first:end]
         pose = face_poses(cam2world.double())[part.index]
-        gaussians = self._select(gaussians, None)
-        size = (self.face_size, self.face_size)
-        image = rasterize(gaussians, pose, size=size, layout="pinhole", **vars(self._options))
+        image = rasterize(gaussians, pose, size=(self.face_size, self.face_size), layout="pinhole")
         return torch.cat((image.color, image.alpha[None]))
 
     def compose(
@@ -139,7 +141,7 @@ class TargetRenderer:
             if self.style == "panorama":
                 image = torch.cat(images, dim=1)
             else:
-                image = stitch_faces(torch.stack(images), self.size, official=self.style == "original")
+                image = stitch_faces(torch.stack(images), self.size)
             panoramas.append(Rendering(image[:3], image[3], torch.zeros_like(image[3])))
         return self._blend(panoramas, cam2world, context)
 
@@ -171,22 +173,10 @@ class TargetRenderer:
         weights = blend_weights(cam2world[:3, 3].double(), context[:, :3, 3].double())
         return blend(panoramas, weights.to(panoramas[0].color)).color
 
-    def _select(self, gaussians: Gaussians, view: int | None) -> Gaussians:
-        """The Gaussians of a view, with the official colours if the style is the official one."""
-        if self.style == "original":
-            gaussians = official_gaussians(gaussians)
-        return gaussians if view is None else gaussians.select((gaussians.views == view).nonzero()[:, 0])
-
     def _render_panorama(self, gaussians: Gaussians, cam2world: Tensor) -> Rendering:
         if self.style == "panorama":
             return rasterize(gaussians, cam2world, size=self.size)
-        return rasterize(
-            gaussians, cam2world, size=self.size, layout="cubemap", face_size=self.face_size, **vars(self._options)
-        )
-
-    @property
-    def _options(self) -> RasterOptions:
-        return RasterOptions("ewa" if self.style == "original" else "ray")
+        return rasterize(gaussians, cam2world, size=self.size, layout="cubemap", face_size=self.face_size)
 
 
 @dataclass(frozen=True)
@@ -200,14 +190,13 @@ class Region:
 
 @torch.no_grad()
 def find_visible_gaussians(
-    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region], options: RasterOptions
+    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], regions: Sequence[Region]
 ) -> list[Bool[Tensor, "n"]]:
     """A mask for each region: the Gaussians that may reach one of its pixels. The others do not affect its colours.
 
     Args:
         cam2world: pose of the camera of all image planes.
         regions: regions of image planes of one size and kind.
-        options: options with which the image planes are rasterised.
     """
     pose = cam2world.double().to(gaussians.means.device)
     found: list[list[Tensor]] = [[] for _ in regions]
@@ -215,11 +204,13 @@ def find_visible_gaussians(
         projected = project_gaussians(
             _without_colours(gaussians, slice(start, start + _CHUNK)),
             pose,
-            filter_variance=options.filter_variance(regions[0].plane.pixel_angle),
-            exact=options.kernel == "ray",
+            filter_variance=_OPTIONS.filter_variance(regions[0].plane.pixel_angle),
+            compensate=_OPTIONS.compensate,
+            exact=False,
         )
         for region, masks in zip(regions, found, strict=True):
-            masks.append(_is_in_region(projected, region, options))
+            boxes = compute_footprints(projected, region.plane, _OPTIONS)[1]
+            masks.append(is_in_image(boxes, region.plane, (region.first, region.end)))
     return [torch.cat(masks) if masks else torch.zeros(0, dtype=torch.bool) for masks in found]
 
 
@@ -228,14 +219,3 @@ def _without_colours(gaussians: Gaussians, rows: slice) -> Gaussians:
     g = gaussians
     geometry = (field[rows] for field in (g.means, g.scales, g.quats, g.opacities))
     return Gaussians(*geometry, g.harmonics[rows, :1] * 0, g.levels[rows], g.views[rows])
-
-
-def _is_in_region(projected: ProjectedGaussians, region: Region, options: RasterOptions) -> Bool[Tensor, "n"]:
-    plane, rows = region.plane, (region.first, region.end)
-    if options.kernel == "ewa":  # footprints behind the camera have no bounding box
-        is_ahead = projected.direction @ plane.rotation[:, 2] > 0
-        mask = torch.zeros_like(is_ahead)
-        boxes = compute_footprints(ProjectedGaussians(*(field[is_ahead] for field in projected)), plane, options)[1]
-        mask[is_ahead] = is_in_image(boxes, plane, rows)
-        return mask
-    return is_in_image(compute_footprints(projected, plane, options)[1], plane, rows)

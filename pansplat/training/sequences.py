@@ -14,16 +14,15 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import CAMERA_POSES, read_loc360_sequence
 from pansplat.inputs.folders import require_known_masks
-from pansplat.inputs.pairs import FAR_SEQUENCE, NEAR, Pair, Panorama
+from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.inputs.views import Sample, Views, select_views
 from pansplat.system.files import expand_home
 
-Stage = Literal["train", "val", "test"]
+Stage = Literal["train", "val"]
 
-LOCATIONS: dict[str, tuple[str, ...]] = {
+LOCATIONS: dict[Stage, tuple[str, ...]] = {
     "train": ("concourse", "hall", "piatrium"),
     "val": ("atrium",),
-    "test": ("atrium",),
 }
 """Locations of 360Loc by stage (docs/official.md, section 2.2)."""
 
@@ -50,10 +49,6 @@ class BoundedSampler:
     min_gap: int = 2
     max_gap: int = 5
     training_gap: Literal["uniform", "original"] = "uniform"
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.min_gap <= self.max_gap:
-            raise InputError(f"needed 1 <= min_gap <= max_gap frames, got {self.min_gap} and {self.max_gap}.")
 
     def training(self, count: int, generator: np.random.Generator) -> FramePair:
         """A random pair of a sequence of `count` frames, and one target from left to right."""
@@ -82,8 +77,8 @@ class ImageSequence:
 
     name: str
     panoramas: tuple[Panorama, ...]
-    near: float = NEAR
-    far: float = FAR_SEQUENCE
+    near: float
+    far: float
 
     @property
     def poses(self) -> Sequence[Float[Tensor, "4 4"]]:

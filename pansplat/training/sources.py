@@ -6,10 +6,7 @@ one of several targets).
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
-import itertools
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,22 +16,23 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import find_panogrf, find_triplets, read_panogrf_scene, read_triplet
+from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
-from pansplat.training.sequences import BoundedSampler, FramePair, ImageSequence, Stage, read_frame_pair
-
-TRAINING_SETS = (("m3d", 0.5),)
-TEST_SETS = (
-    ("m3d", 0.1),
-    ("m3d", 0.25),
-    ("m3d", 0.5),
-    ("m3d", 0.75),
-    ("m3d", 1.0),
-    ("residential", 0.15),
-    ("replica", 0.5),
+from pansplat.training.config import DataConfig
+from pansplat.training.room import RoomTriplets
+from pansplat.training.sequences import (
+    BoundedSampler,
+    FramePair,
+    ImageSequence,
+    Stage,
+    read_frame_pair,
+    read_loc360,
 )
-"""PanoGRF's sets: data set of the scenes, metres from an input to the middle view (the baseline is twice that)."""
+
+_VALIDATION_SEED_OFFSET = 1_000_003  # rooms differ from those of training
+_VALIDATION_DRAWS = 4  # frame pairs per sequence
 
 
 class SampleSource(Protocol):
@@ -49,83 +47,50 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class PairSource:
-    """Pairs with targets; each is a sample.
-
-    Attributes:
-        pairs: files are read by `sample`.
-        targets: number of randomly chosen targets per sample; None for all.
-    """
+    """Pairs with targets; each is a sample. Files are read by `sample`."""
 
     pairs: Sequence[Pair]
-    targets: int | None = None
 
     def __post_init__(self) -> None:
-        for pair in self.pairs:
-            _check_targets(pair, self.targets or 1)
         if not self.pairs:
-            raise InputError("needed pairs with targets for training or evaluation, got none; see docs/input.md.")
+            raise InputError("needed pairs with targets for training, got none; see docs/input.md.")
 
     def __len__(self) -> int:
         return len(self.pairs)
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
-        return _read_pair(self.pairs[index], height, self.targets, seed)
+        return _read_pair(self.pairs[index], height, seed)
 
 
 @dataclass(frozen=True)
-class TripletSet:
-    """Triplets on disk, in PanoGRF's format or that of game maps.
+class TripletSource:
+    """Triplets on disk, in PanoGRF's format or that of game maps; each is a sample.
 
     Attributes:
-        name: such as "m3d_dist_0.5".
-        folder: folder of the triplets; may be missing.
-        sources: a scene folder or .json file per triplet, sorted; empty if the folder is missing.
+        sources: a scene folder or .json file per triplet.
     """
 
-    name: str
-    folder: Path
     sources: tuple[Path, ...]
 
-    def pair(self, index: int) -> Pair:
-        """Triplet `index` as a pair with a target; without detection of static content."""
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def sample(self, index: int, height: int, seed: int) -> Sample:
         source = self.sources[index]
         is_triplet = source.is_file()
         collection = read_triplet(source, source.parent) if is_triplet else read_panogrf_scene(source, source)
         (pair,) = collection.pairs()
         if not pair.targets:
             raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
-        return dataclasses.replace(pair, siblings=())
+        return _read_pair(dataclasses.replace(pair, siblings=()), height, seed)  # without detection of static content
 
 
-@dataclass(frozen=True)
-class TripletSource:
-    """Triplets on disk; each is a sample. `targets` as in `PairSource`."""
-
-    triplets: TripletSet
-    targets: int | None = None
-
-    def __len__(self) -> int:
-        return len(self.triplets.sources)
-
-    def sample(self, index: int, height: int, seed: int) -> Sample:
-        pair = self.triplets.pair(index)
-        _check_targets(pair, self.targets or 1)
-        return _read_pair(pair, height, self.targets, seed)
-
-
-def _check_targets(pair: Pair, least: int) -> None:
-    if len(pair.targets) < least:
-        raise InputError(
-            f"{pair.name} in {pair.folder}: needed {least} target panorama(s) for comparison, got "
-            f'{len(pair.targets)}; give a "target" in pairs.json or remove the pair.'
-        )
-
-
-def _read_pair(pair: Pair, height: int, count: int | None, seed: int) -> Sample:
-    if count is not None and count < len(pair.targets):
-        chosen = np.random.default_rng(seed).choice(len(pair.targets), count, replace=False)
-        pair = dataclasses.replace(pair, targets=tuple(pair.targets[i] for i in chosen))
-    return Sample(pair.name, pair.load_context(height), pair.load_targets(height))
+def _read_pair(pair: Pair, height: int, seed: int) -> Sample:
+    """The sample of a pair with one of its targets."""
+    target = pair.targets[np.random.default_rng(seed).integers(len(pair.targets))]
+    return Sample(
+        pair.name, pair.load_context(height), dataclasses.replace(pair, targets=(target,)).load_targets(height)
+    )
 
 
 @dataclass(frozen=True)
@@ -163,59 +128,27 @@ class FixedFramePairs:
         return read_frame_pair(*self.pairs[index], height)
 
 
-class ConcatSource:
-    """The samples of several sources, one source after another."""
-
-    def __init__(self, sources: Sequence[SampleSource]) -> None:
-        self.sources = [source for source in sources if len(source)]
-        self.ends = list(itertools.accumulate(len(source) for source in self.sources))
-
-    def __len__(self) -> int:
-        return self.ends[-1] if self.ends else 0
-
-    def sample(self, index: int, height: int, seed: int) -> Sample:
-        number = bisect.bisect_right(self.ends, index)
-        start = self.ends[number - 1] if number else 0
-        return self.sources[number].sample(index - start, height, seed)
-
-
-def panogrf_folder(root: Path | str, stage: Stage, name: str, distance: float, height: int) -> Path:
-    """Folder of one of PanoGRF's sets; heights up to 512 use the 1024x512 images."""
-    rows = max(height, 512)
-    return Path(root) / f"png_render_{stage}_{2 * rows}x{rows}_seq_len_3_{name}_dist_{distance}"
-
-
-def read_panogrf(
-    root: Path | str, stage: Stage, height: int, sets: Sequence[tuple[str, float]] | None = None
-) -> list[TripletSet]:
-    """PanoGRF's sets in a folder. A missing set is empty, with a warning. Source: docs/official.md, section 2.1.
+def read_panogrf(root: Path | str, stage: Stage, height: int) -> TripletSource:
+    """PanoGRF's triplets of Matterport3D, 0.5 m between views. Source: docs/official.md, section 2.1.
 
     Args:
         root: the folder that holds png_render_{stage}_... folders.
-        stage: train and val have m3d at 0.5 m only.
-        height: height at which the panoramas will be read, pixels.
-        sets: data set and distance of each set; None for all of the stage.
+        stage: train or val.
+        height: height at which the panoramas will be read, pixels; up to 512 the 1024x512 images are read.
     """
-    root = expand_home(root)
-    sets = sets if sets is not None else TEST_SETS if stage == "test" else TRAINING_SETS
-    found = []
-    for name, distance in sets:
-        folder = panogrf_folder(root, stage, name, distance, height)
-        scenes = sorted(folder.iterdir()) if folder.is_dir() else []
-        scenes = [scene for scene in scenes if scene.is_dir() and find_panogrf(scene)]
-        found.append(TripletSet(f"{name}_dist_{distance}", folder, tuple(scenes)))
-    missing = [str(triplets.folder) for triplets in found if not triplets.sources]
-    if len(missing) == len(found):
+    rows = max(height, 512)
+    folder = expand_home(root) / f"png_render_{stage}_{2 * rows}x{rows}_seq_len_3_m3d_dist_0.5"
+    scenes = sorted(folder.iterdir()) if folder.is_dir() else []
+    scenes = [scene for scene in scenes if scene.is_dir() and find_panogrf(scene)]
+    if not scenes:
         raise InputError(
-            f"{root}: needed PanoGRF scenes for {stage}, got none in {', '.join(missing)}; give the folder that holds "
-            "these, or download them."
+            f"{root}: needed PanoGRF scenes for {stage}, got none in {folder}; give the folder that holds it, or "
+            "download it."
         )
-    if missing:
-        warnings.warn(f"no PanoGRF scenes in {', '.join(missing)}; these sets are skipped.", stacklevel=2)
-    return found
+    return TripletSource(tuple(scenes))
 
 
-def read_game_maps(folder: Path | str) -> TripletSet:
+def read_game_maps(folder: Path | str) -> TripletSource:
     """The game-map triplets (NAME.json) of a folder."""
     folder = expand_home(folder)
     sources = tuple(find_triplets(folder))
@@ -223,4 +156,29 @@ def read_game_maps(folder: Path | str) -> TripletSet:
         raise InputError(
             f"{folder}: needed triplets (NAME.json with NAME_0.png next to it), got none; see docs/input.md."
         )
-    return TripletSet(folder.resolve().name, folder, sources)
+    return TripletSource(sources)
+
+
+def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSource, SampleSource]:
+    """Training samples, and validation samples, which have at least one target.
+
+    Args:
+        height: height of the panoramas; selects the folder of some data sets.
+    """
+    if config.kind == "room":
+        return RoomTriplets(seed), RoomTriplets(seed + _VALIDATION_SEED_OFFSET)
+    root = config.root
+    assert root is not None
+    if config.kind == "panogrf":
+        return read_panogrf(root, "train", height), read_panogrf(root, "val", height)
+    if config.kind in ("pairs", "triplets"):
+        read = _read_pairs if config.kind == "pairs" else read_game_maps
+        return read(root), read(config.validation_root or root)
+    sampler = BoundedSampler(training_gap=config.training_gap)
+    training = RandomFramePairs(read_loc360(root, "train"), sampler, config.draws)
+    unseen = read_loc360(root, "val")
+    return training, FixedFramePairs(unseen, lambda count: sampler.evaluation(count, _VALIDATION_DRAWS))
+
+
+def _read_pairs(folder: Path) -> PairSource:
+    return PairSource([pair for pair in load_pairs(folder) if pair.targets])

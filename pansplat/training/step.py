@@ -1,10 +1,10 @@
-"""Loss and gradients of the batches of one training step."""
+"""Loss and gradients of the batch of one training step."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from pansplat.inputs.views import Batch
 from pansplat.model.heads import AuxiliaryHeads, MatchedViews
@@ -19,47 +19,23 @@ LOSS_TERMS: tuple[str, ...] = ("loss", "square", "perceptual", "depth", "auxilia
 """Names of the total loss and its terms."""
 
 
-def accumulate_gradients(step: TrainingStep, batches: Sequence[Batch]) -> LossTerms:
-    """Add the gradients of the batches' mean loss to the parameters' gradients; returns the mean loss terms.
-
-    Args:
-        batches: batches of one step, one per round of accumulation.
-    """
-    sums, weight = dict.fromkeys(LOSS_TERMS, 0.0), 1 / len(batches)
-    for batch in batches:
-        loss, terms = step(batch, weight)
-        if loss.requires_grad:
-            loss.backward()
-        sums = {name: sums[name] + terms[name] / len(batches) for name in LOSS_TERMS}
-    return sums
-
-
-class TrainingStep(nn.Module):
+@dataclass(frozen=True)
+class TrainingStep:
     """Loss of a batch, and its gradients.
 
-    Args:
+    Attributes:
         auxiliary: heads for the auxiliary loss; None for no auxiliary loss.
         perceptual: None for no perceptual loss.
     """
 
-    def __init__(
-        self,
-        network: PanSplat,
-        auxiliary: AuxiliaryHeads | None,
-        perceptual: Perceptual | None,
-        weights: LossWeights,
-        memory: MemoryConfig,
-    ) -> None:
-        super().__init__()
-        self.network, self.auxiliary, self.perceptual = network, auxiliary, perceptual
-        self.weights, self.memory = weights, memory
+    network: PanSplat
+    auxiliary: AuxiliaryHeads | None
+    perceptual: Perceptual | None
+    weights: LossWeights
+    memory: MemoryConfig
 
-    def forward(self, batch: Batch, weight: float = 1.0) -> tuple[Tensor, LossTerms]:
-        """`weight` times the loss, and the loss terms.
-
-        With plain backpropagation the loss has a graph, and the caller calls `backward()`. Otherwise it has no graph,
-        and its gradients have already been added to the parameters' gradients.
-        """
+    def __call__(self, batch: Batch) -> LossTerms:
+        """Add the gradients of the loss to the parameters' gradients; returns the loss and its terms."""
         parameter = next(self.network.parameters())
         batch = batch.to(parameter.device, parameter.dtype)
         renderer = TargetRenderer(self.memory.style, self.memory.mixing, batch.images.shape[-2])
@@ -91,10 +67,12 @@ class TrainingStep(nn.Module):
         options = {"tiles": self.memory.tiles, "matching_is_trainable": matching_is_trainable(self.network)}
         if self.memory.backpropagation == "plain":
             loss, terms = whole_loss(problem, self.network, renderer, **options)
+            if loss.requires_grad:
+                loss.backward()
         else:
             method = self.memory.backpropagation
-            loss, terms = backpropagate(problem, self.network, renderer, method=method, weight=weight, **options)
-        return weight * loss, {**dict.fromkeys(LOSS_TERMS, 0.0), **terms, "loss": loss.item()}
+            loss, terms = backpropagate(problem, self.network, renderer, method=method, **options)
+        return {**dict.fromkeys(LOSS_TERMS, 0.0), **terms, "loss": loss.item()}
 
     def _depth_loss(self, batch: Batch, matched: MatchedViews) -> Tensor | None:
         if batch.depths is None or not self.weights.depth:

@@ -6,7 +6,6 @@ and random numbers. A run that was killed therefore continues exactly as an unin
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -20,12 +19,10 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.inputs.views import Batch
-from pansplat.model.weights import pack_weights
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.checkpoint import load_latest, restore, restore_optimizer, save_checkpoint
 from pansplat.training.config import TrainConfig, as_json, require_same
-from pansplat.training.datasets import load_sources
 from pansplat.training.loader import Loader
 from pansplat.training.logs import CsvTable, ProgressDisplay, plot_run
 from pansplat.training.losses import choose_perceptual
@@ -38,7 +35,8 @@ from pansplat.training.network import (
 )
 from pansplat.training.optimization import ExponentialMovingAverage, one_cycle_rate
 from pansplat.training.rendering import TargetRenderer
-from pansplat.training.step import LOSS_TERMS, TrainingStep, accumulate_gradients
+from pansplat.training.sources import load_sources
+from pansplat.training.step import LOSS_TERMS, TrainingStep
 from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, describe_measures, validate
 
@@ -115,9 +113,9 @@ class Trainer:
                     progress.print(f"resuming from {self.resumed_from}")
                 elif self.config.validation.every:
                     self._validate(logs, progress)  # the untrained network, for comparison
-                for batches in self._batches():
+                for batch in self._batches():
                     began = time.perf_counter()
-                    values = self._optimize(batches)
+                    values = self._optimize(batch)
                     values["seconds"] = time.perf_counter() - began
                     logs.steps.add(self.step, values)
                     self.step += 1
@@ -141,14 +139,14 @@ class Trainer:
         """Write a checkpoint and delete old ones."""
         save_checkpoint(self.folder, self.step, self._state(), keep=self.config.checkpoint.keep)
 
-    def _batches(self) -> Iterator[list[Batch]]:
-        """The batches of each remaining step, one per round of accumulation."""
-        settings, height, stream = self.config.optimizer, 0, None
-        for step in range(self.step, settings.steps):
+    def _batches(self) -> Iterator[Batch]:
+        """The batch of each remaining step."""
+        height, stream = 0, None
+        for step in range(self.step, self.config.optimizer.steps):
             if stream is None or self.config.height_at(step) != height:
                 height = self.config.height_at(step)
-                stream = self._loader(height).batches(step * settings.accumulate)
-            yield [next(stream) for _ in range(settings.accumulate)]
+                stream = self._loader(height).batches(step)
+            yield next(stream)
 
     def _loader(self, height: int) -> Loader:
         source, _ = load_sources(self.config.data, height, self.config.seed)
@@ -161,7 +159,7 @@ class Trainer:
             augmentation=self.config.data.augmentation,
         )
 
-    def _optimize(self, batches: list[Batch]) -> dict[str, float]:
+    def _optimize(self, batch: Batch) -> dict[str, float]:
         """One optimiser step; returns its loss terms, learning rate and gradient norm."""
         settings = self.config.optimizer
         rate = one_cycle_rate(self.step, settings.steps + _EXTRA_STEPS, settings.rate)
@@ -169,27 +167,26 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad()
-        terms = accumulate_gradients(self._training_step, batches)
+        terms = self._training_step(batch)
         parameters = list(trainable_parameters(self.network, self.auxiliary))
         norm = float(torch.nn.utils.clip_grad_norm_(parameters, settings.clip))
         if not (math.isfinite(terms["loss"]) and math.isfinite(norm)):
-            self._raise_not_finite(batches, terms["loss"], norm)
+            self._raise_not_finite(batch, terms["loss"], norm)
         self.optimizer.step()
         if self.average is not None:
             self.average.update(self.network, self.step)
         return {**terms, "rate": rate, "gradient_norm": norm}
 
-    def _raise_not_finite(self, batches: list[Batch], loss: float, norm: float) -> None:
-        """Save the batches and weights of a step whose loss or gradient is not finite, and raise an InputError."""
+    def _raise_not_finite(self, batch: Batch, loss: float, norm: float) -> None:
+        """Save the batch and weights of a step whose loss or gradient is not finite, and raise an InputError."""
         path = self.config.out / f"not_finite_{self.step:08d}.pt"
         self.config.out.mkdir(parents=True, exist_ok=True)
-        fields = [{**vars(batch), "names": list(batch.names)} for batch in batches]
+        fields = {**vars(batch), "names": list(batch.names)}
         with replacing(path, failures=(RuntimeError,)) as partial:
-            torch.save({"step": self.step, "batches": fields, "network": self.network.state_dict()}, partial)
-        names = ", ".join(name for batch in batches for name in batch.names)
+            torch.save({"step": self.step, "batch": fields, "network": self.network.state_dict()}, partial)
         raise InputError(
             f"step {self.step}: needed finite numbers, got a loss of {loss} and a gradient of norm {norm} from "
-            f"{names}; the batch and the weights before the step are in {path}. Check the data, lower "
+            f"{', '.join(batch.names)}; the batch and the weights before the step are in {path}. Check the data, lower "
             "--optimizer.rate, and resume from the last checkpoint."
         )
 
@@ -233,11 +230,8 @@ class Trainer:
         return bool(every) and (self.step % every == 0 or self.step == self.config.optimizer.steps)
 
     def _state(self) -> dict[str, Any]:
-        weights = pack_weights(self.network.model, self.network.config, {}, compat=self.network.compat)
-        header = {"model": weights.model, "config": weights.config, "compat": weights.compat}
         return {
             "config": as_json(self.config),
-            "weights": json.dumps(header),
             "network": self.network.state_dict(),
             "auxiliary": None if self.auxiliary is None else self.auxiliary.state_dict(),
             "mean": None if self.average is None else self.average.state,

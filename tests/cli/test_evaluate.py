@@ -1,13 +1,10 @@
-"""`pansplat evaluate` on folders of pairs and with --protocol: files, output, refused arguments."""
+"""`pansplat evaluate` on folders of pairs: files, output, refused arguments."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
-from pansplat import pipeline
 from pansplat.cli import run
 
 HEIGHT = 64
@@ -46,40 +43,3 @@ def test_folders_without_targets_are_refused(tmp_path: Path, write_room, capsys)
     alone = write_room(tmp_path / "alone", target=False)
     assert run(["evaluate", str(alone), "--out", str(tmp_path / "out"), "--model", "sphere"]) == 2
     assert "none of the pairs has a target view" in capsys.readouterr().err
-
-
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    """One Replica triplet in PanoGRF's layout."""
-    scene = tmp_path / "data" / "png_render_test_1024x512_seq_len_3_replica_dist_0.5" / "00000000"
-    for view in range(3):
-        folder = scene / f"{view:02d}"
-        folder.mkdir(parents=True)
-        Image.fromarray(np.full((HEIGHT, 2 * HEIGHT, 3), 60 * view + 60, np.uint8)).save(folder / "rgb.png")
-        np.savetxt(folder / "rot.txt", np.eye(3))
-        np.savetxt(folder / "tran.txt", [0.5 * view, 0, 0])
-    return tmp_path / "data"
-
-
-def arguments(data: Path, out: Path, *more: str) -> list[str]:
-    start = ["evaluate", "--protocol", "replica", "--data", str(data), "--out", str(out), "--model", "sphere"]
-    return [*start, "--height", str(HEIGHT), *more]
-
-
-def test_a_protocol_prints_the_papers_rows_and_ours(data: Path, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "out"
-    assert run(arguments(data, out)) == 0
-    printed = capsys.readouterr().out
-    assert "PanoGRF" in printed and "29.22" in printed and "ours, sphere + deferred blending" in printed
-    assert "Replica 1.0 m: 1 image" in printed and "No LPIPS" in printed
-    (row,) = json.loads((out / "results.json").read_text())["results"]
-    assert f"{row['ws_psnr']:.2f}" in printed and row["lpips"] is None
-    assert "29.22" in (out / "table.md").read_text()
-    assert (out / "replica_1.0_m" / "00000000" / "01_target.png").is_file()
-
-
-def test_each_model_has_a_row(data: Path, tmp_path: Path, sphere_model: type, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(pipeline._MODELS, "other", sphere_model)
-    assert run(arguments(data, tmp_path / "out", "--models", "other", "--blend", "joint")) == 0
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())["results"]
-    assert [row["method"] for row in rows] == ["ours, sphere", "ours, other"]

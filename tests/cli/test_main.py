@@ -26,7 +26,7 @@ def run_program(program: str) -> str:
 
 def test_help_does_not_import_torch() -> None:
     names = ["predict", "render", "refine", "export", "pose", "batch", "evaluate", "check", "info", "convert"]
-    names += [f"bench {name}" for name in ("raster", "model", "refine", "flights", "viewer", "pose")]
+    names += [f"bench {name}" for name in ("raster", "model", "refine", "viewer", "pose")]
     program = (
         f"import sys\nfrom pansplat.cli import run\nfor name in ['', 'bench', *{names}]:\n"
         "    try: run([*name.split(), '--help'])\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
@@ -133,13 +133,7 @@ REFUSED = {
     "export room -o room --training-set": "needed a new or empty folder, got one with files",
     "export room -o x --training-set --crop 0 0 0 1 1 1": "--remove-floaters are not for a folder to train from",
     "evaluate -o x": "at least one folder",
-    "evaluate -o x --protocol m3d": "--protocol needs --data",
-    "evaluate room -o x --protocol m3d --data room": "as well; leave it out",
-    "evaluate -o x --protocol m3d --data room --near 1": "--near is set by the protocol",
-    "evaluate -o x --protocol m3d --data room --blend view0": "--blend must be joint or deferred with --protocol",
-    "evaluate -o x --protocol m3d --data room --model sphere --models sphere": "must have distinct names",
-    "evaluate -o x --protocol replica --data room --model sphere --lpips vgg": "LPIPS with vgg needed vgg16-397923af",
-    "evaluate -o x --protocol 360loc --data room --model sphere": "360Loc: needed",
+    "evaluate room -o x --model sphere --lpips vgg": "LPIPS with vgg needed vgg16-397923af",
     "convert path.txt -o x.ckpt": "--out must end in .safetensors",
     "convert path.txt -o no/x.safetensors": "existing folder",
 }

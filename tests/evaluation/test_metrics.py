@@ -1,4 +1,4 @@
-"""The metrics equal the official protocol's, by value; depth errors and the cross-fade have their closed forms."""
+"""The metrics equal the official protocol's, by value; the cross-fade has its closed forms."""
 
 import math
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pansplat.evaluation.metrics import cross_fade, depth_errors, psnr, ssim, ws_psnr
+from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.geometry.pose import rotations_from_quats
 
@@ -87,27 +87,6 @@ def test_images_and_masks_that_do_not_fit_are_refused(unchecked: None) -> None:
         psnr(image, image, mask=torch.ones(8, 16, dtype=torch.bool))
     with pytest.raises(ValueError, match="larger than 10 x 10"):
         ssim(image[:, :10], image[:, :10])
-
-
-NEAR, FAR = 0.45, 10.0
-
-
-def test_depth_errors_are_means_over_the_known_pixels_of_all_views() -> None:
-    truth = torch.full((2, 4, 8), 2.0)
-    truth[0, :3] = torch.tensor((0.0, NEAR, FAR))[:, None]  # unknown: the first view has a quarter of its pixels
-    depth = torch.full((2, 4, 8), 3.0)
-    depth[1], depth[0, :3] = 4.0, 100.0
-    errors = depth_errors(depth, truth, NEAR, FAR)
-    expected = {"abs_rel": (8 * 0.5 + 32 * 1.0) / 40, "sq_rel": (8 * 0.5 + 32 * 2) / 40}
-    assert errors == pytest.approx(expected | {"rmse": math.sqrt((8 * 1 + 32 * 4) / 40)})
-    assert depth_errors(depth, torch.zeros_like(truth), NEAR, FAR) == {}
-
-
-def test_a_smaller_depth_map_is_resized_bilinearly() -> None:
-    """Two columns of 1 and 3 metres become 1, 1.5, 2.5, 3."""
-    depth = torch.tensor([1.0, 3.0]).expand(1, 1, 2)
-    truth = torch.tensor([1.0, 1.5, 2.5, 3.0]).expand(1, 2, 4)
-    assert depth_errors(depth, truth, NEAR, FAR)["rmse"] == pytest.approx(0, abs=1e-12)
 
 
 def pose_at(x: float, quat: tuple[float, ...] = (1, 0, 0, 0)) -> torch.Tensor:

@@ -3,6 +3,8 @@
 import functools
 import io
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.evaluation.report import evaluate, results_table
 from pansplat.evaluation.results import Row
 from pansplat.inputs.folders import load_pairs
+from pansplat.training.sequences import BoundedSampler
 
 HEIGHT = 16
 KEYS = [
@@ -145,3 +148,22 @@ def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(
     assert refined.get("own_ws_psnr") > plain.get("own_ws_psnr") > 5
     headings = [str(column.header) for column in results_table([refined]).columns]
     assert "at inputs" in headings and "refine s" in headings
+
+
+def test_the_documented_script_states_the_papers_pairs_of_360loc(tmp_path: Path, write_panorama: Callable) -> None:
+    """docs/evaluation.md: the official inputs, targets and range, and without detection of what moves with a camera."""
+    for frame in range(120):
+        write_panorama(tmp_path / "image" / f"{frame}.png", frame / 120)
+    poses = {f"{frame}.png": [[1, 0, 0, 0.2 * frame], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for frame in range(120)}
+    (tmp_path / "camera_pose.json").write_text(json.dumps(poses))
+    Image.new("L", (16, 8), 255).save(tmp_path / "mask.png")
+    text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
+    script = text.split("```python\n")[1].split("```")[0]
+    subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
+    pairs = load_pairs(tmp_path)
+    with_targets = [([view.name for view in pair.context], [view.name for view in pair.targets]) for pair in pairs]
+    expected = BoundedSampler().evaluation(120)
+    assert with_targets == [
+        ([f"{pair.left}", f"{pair.right}"], [f"{frame}" for frame in pair.targets]) for pair in expected
+    ]
+    assert len(pairs) == 100 and {pair.far for pair in pairs} == {50} and pairs[0].load_context(8).masks.all()

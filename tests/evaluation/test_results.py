@@ -11,7 +11,7 @@ from rich.console import Console
 from pansplat.errors import InputError
 from pansplat.evaluation.results import Column, Row, average_rows, markdown_table, rich_table, write_json
 
-COLUMNS = (Column("method", "method"), Column("A\nPSNR", "psnr", ".2f", "-"), Column("A\nSSIM", "ssim", ".3f", "-"))
+COLUMNS = (Column("method", "method"), Column("PSNR", "psnr", ".2f"), Column("SSIM", "ssim", ".3f"))
 ROWS = (Row({"method": "paper"}, {"psnr": 21.5}), Row({"method": "exact"}, {"psnr": math.inf, "ssim": 1.0}))
 OURS = Row({"method": "ours"}, {"psnr": 20.0, "ssim": 0.75})
 
@@ -29,10 +29,10 @@ def test_a_mean_is_that_of_the_rows_with_the_value() -> None:
     ]
 
 
-def test_tables_have_formatted_cells_and_our_rows_below() -> None:
-    assert markdown_table("speed", COLUMNS, ROWS, [OURS]).splitlines() == [
-        *("### Speed", "", "| method | A PSNR | A SSIM |", "| --- | ---: | ---: |"),
-        *("| paper | 21.50 | - |", "| exact | exact | 1.000 |", "| **ours** | **20.00** | **0.750** |"),
+def test_tables_have_formatted_cells_and_printed_ones_more_rows_below() -> None:
+    assert markdown_table("speed", COLUMNS, ROWS).splitlines() == [
+        *("### Speed", "", "| method | PSNR | SSIM |", "| --- | ---: | ---: |"),
+        *("| paper | 21.50 |  |", "| exact | exact | 1.000 |"),
     ]
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(rich_table("speed", COLUMNS, ROWS, [OURS]))

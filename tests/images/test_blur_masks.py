@@ -304,14 +304,14 @@ def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
 
 
 def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
-    folders = [tmp_path / location / "mapping" / "daytime_360_0" for location in LOCATIONS["test"]]
+    folders = [tmp_path / location / "mapping" / "daytime_360_0" for location in LOCATIONS["val"]]
     for folder in folders:
         _write(folder / "image" / "frame_0.png", 0, None)
         (folder / "camera_pose.json").write_text(json.dumps({"frame_0.png": np.eye(4).tolist()}))
-    assert read_loc360(tmp_path, "test")
+    assert read_loc360(tmp_path, "val")
     _draw_mask(folders[-1] / "image" / "frame_1_blur.png")
     with pytest.raises(InputError, match=r"frame_1_blur\.png: needed the name .* \(did you mean frame_0_blur"):
-        read_loc360(tmp_path, "test")
+        read_loc360(tmp_path, "val")
 
 
 SIDE = 48  # pixels along a face

@@ -14,7 +14,7 @@ from pansplat.training.config import Mixing, Style
 from pansplat.training.rendering import TargetRenderer
 
 HEIGHT = 32
-STYLES: tuple[Style, ...] = ("panorama", "cubemap", "original")
+STYLES: tuple[Style, ...] = ("panorama", "cubemap")
 POSE = torch.eye(4, dtype=torch.float64)
 POSE[:3, 3] = torch.tensor([0.2, -0.1, 0.3])
 CONTEXT = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)

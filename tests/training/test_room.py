@@ -7,8 +7,8 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
 from pansplat.inputs.views import Views
 from pansplat.training.config import DataConfig
-from pansplat.training.datasets import load_sources
 from pansplat.training.room import RoomTriplets
+from pansplat.training.sources import load_sources
 
 
 def test_triplets_are_determined_by_seed_and_index() -> None:

@@ -12,7 +12,8 @@ import torch
 from pansplat.errors import InputError
 from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.views import collate
-from pansplat.training.sources import ConcatSource, PairSource, TripletSource, read_game_maps, read_panogrf
+from pansplat.training.config import DataConfig
+from pansplat.training.sources import PairSource, TripletSource, load_sources, read_game_maps, read_panogrf
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def write_triplets(write_panorama: Callable, write_depth: Callable, matrix: Call
                 write_panorama(folder / f"{name}_{i}.png", 0.2 * (i + 1))
                 write_depth(folder / f"{name}_{i}_depth.png", 1000 * (i + 1))
             (folder / f"{name}.json").write_text(json.dumps({"c2w": [matrix(0), matrix(1), matrix(2)]}))
-        return TripletSource(read_game_maps(folder))
+        return read_game_maps(folder)
 
     return write
 
@@ -52,18 +53,15 @@ def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_tri
         collate([])
 
 
-def test_panogrf_sets_are_read_by_stage_and_missing_ones_warn(tmp_path: Path, write_panorama: Callable) -> None:
-    for kind, scenes in (("m3d_dist_0.5", 2), ("m3d_dist_1.0", 1)):
-        for scene, i in itertools.product(range(scenes), range(3)):
-            view = tmp_path / f"png_render_test_1024x512_seq_len_3_{kind}" / f"{scene:08d}" / f"{i:02d}"
-            write_panorama(view / "rgb.png", 0.2 * (i + 1))
-            np.savetxt(view / "rot.txt", np.eye(3))
-            np.savetxt(view / "tran.txt", [0, 0, 0.5 * i])
-    with pytest.warns(UserWarning, match=r"no PanoGRF scenes in .*m3d_dist_0\.1.*replica_dist_0\.5; these sets"):
-        sets = read_panogrf(tmp_path, "test", 256)
-    assert [(s.name, len(s.sources)) for s in sets if s.sources] == [("m3d_dist_0.5", 2), ("m3d_dist_1.0", 1)]
-    assert len(sets) == 7
-    sample = TripletSource(sets[2]).sample(1, 8, 0)
+def test_panogrf_scenes_are_read_by_stage_and_height(tmp_path: Path, write_panorama: Callable) -> None:
+    for scene, i in itertools.product(range(2), range(3)):
+        view = tmp_path / "png_render_val_1024x512_seq_len_3_m3d_dist_0.5" / f"{scene:08d}" / f"{i:02d}"
+        write_panorama(view / "rgb.png", 0.2 * (i + 1))
+        np.savetxt(view / "rot.txt", np.eye(3))
+        np.savetxt(view / "tran.txt", [0, 0, 0.5 * i])
+    source = read_panogrf(tmp_path, "val", 256)
+    assert len(source) == 2
+    sample = source.sample(1, 8, 0)
     assert sample.name == "00000001"
     assert sample.context.images[:, 0, 0, 0].tolist() == pytest.approx([0.2, 0.6], abs=3e-3)
     # A file's +z is the world's -y (docs/official.md, section 2.1).
@@ -71,7 +69,7 @@ def test_panogrf_sets_are_read_by_stage_and_missing_ones_warn(tmp_path: Path, wr
     with pytest.raises(InputError, match=r"scenes for train, got none in .*png_render_train_1024x512_seq_len_3_m3d"):
         read_panogrf(tmp_path, "train", 512)
     with pytest.raises(InputError, match=r"4096x2048_seq_len_3_m3d_dist_0\.5"):
-        read_panogrf(tmp_path, "test", 2048, [("m3d", 0.5)])
+        read_panogrf(tmp_path, "val", 2048)
 
 
 def test_pairs_need_targets_and_a_random_one_is_chosen(
@@ -82,23 +80,19 @@ def test_pairs_need_targets_and_a_random_one_is_chosen(
         write_panorama(tmp_path / name, i / 10)
     poses = {name: matrix(i) for i, name in enumerate(names)}
     (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    with pytest.raises(InputError, match="needed 1 target panorama"):
-        PairSource(load_pairs(tmp_path))
     groups = {"pairs": [{"context": ["0.png", "4.png"], "target": ["1.png", "2.png", "3.png"]}]}
     (tmp_path / "pairs.json").write_text(json.dumps(groups))
     pairs = load_pairs(tmp_path)
-    assert PairSource(pairs).sample(0, 8, 0).targets.names == ("1", "2", "3")
-    chosen = {PairSource(pairs, targets=1).sample(0, 8, seed).targets.names for seed in range(20)}
+    chosen = {PairSource(pairs).sample(0, 8, seed).targets.names for seed in range(20)}
     assert chosen == {("1",), ("2",), ("3",)}
-    with pytest.raises(InputError, match="needed 4 target"):
-        PairSource(pairs, targets=4)
+    with pytest.raises(InputError, match="needed pairs with targets for training, got none"):
+        PairSource([])
 
 
-def test_concatenated_sources_keep_their_order(tmp_path: Path, write_triplets: Callable) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    first.mkdir()
-    second.mkdir()
-    maps, others = write_triplets(first, "a", "b"), write_triplets(second, "c", "d", "e")
-    concatenated = ConcatSource([maps, ConcatSource([]), others, maps])
-    assert len(concatenated) == 7
-    assert [concatenated.sample(i, 8, 0).name for i in range(7)] == ["a", "b", "c", "d", "e", "a", "b"]
+@pytest.mark.shared
+def test_a_folder_of_triplets_is_read_as_triplets_and_as_pairs(shared: Path) -> None:
+    root = shared / "data" / "bsp_demo"
+    for source in load_sources(DataConfig("triplets", root), 64, 0):
+        assert isinstance(source, TripletSource) and len(source) == 12
+    for source in load_sources(DataConfig("pairs", root), 64, 0):
+        assert isinstance(source, PairSource) and len(source) == 12

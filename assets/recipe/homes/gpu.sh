@@ -35,7 +35,7 @@ step() { # limit in seconds, name, command...
 truth() {
     local each=$((limits[0] / 4)) suite
     [ "$DEVICE" = cuda ] && step $each triton env TRITON_INTERPRET=0 $bin/pytest -q -m "exhaustive or not exhaustive" tests/rendering/cuda
-    for suite in raster model viewer; do step $each $suite $bin/pansplat bench $suite $quick --overwrite --json "$OUT/$suite.json"; done
+    for suite in raster model viewer; do step $each $suite $bin/pansplat bench $suite $quick --overwrite --out "$OUT"; done
 }
 
 # Refinement for equal steps and for 10 s, and a film, on each device: time beside error, in devices.md.

@@ -100,7 +100,7 @@ class Photographs:
 
 @dataclass(frozen=True)
 class Flights:
-    """Render flights through generated homes, with targets on the way, for `pansplat bench flights`."""
+    """Render flights through generated homes, with targets on the way, for `pansplat evaluate`."""
 
     out: Out
     """Folder for the flights. Flights that are there are kept; run the command again after an interruption."""

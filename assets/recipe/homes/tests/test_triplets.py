@@ -8,7 +8,7 @@ import torch
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.warp import relative_pose, warp_panorama
 from pansplat.training.config import DataConfig
-from pansplat.training.datasets import load_sources
+from pansplat.training.sources import load_sources
 from pansplat_homes.triplets import GeneratedTriplets, write_triplet
 
 HEIGHT = 64
