@@ -205,8 +205,7 @@ def find_visible_gaussians(
             _without_colours(gaussians, slice(start, start + _CHUNK)),
             pose,
             filter_variance=_OPTIONS.filter_variance(regions[0].plane.pixel_angle),
-            compensate=_OPTIONS.compensate,
-            exact=False,
+            exact=True,
         )
         for region, masks in zip(regions, found, strict=True):
             boxes = compute_footprints(projected, region.plane, _OPTIONS)[1]

@@ -99,7 +99,6 @@ REFUSED = {
     "predict room -o x.ply --model sphere --precision bfloat16": "`precision` is for networks, and sphere is not one",
     "refine room -o x.ply --seconds 1 --steps 3": "--seconds and --steps both",
     "refine room -o x.ply --photographs elsewhere": "--photographs is for a scene file",
-    "refine room -o x.ply --report report.txt": "--report must end in .json",
     "refine room -o x.ply --model sphere --poses": "add --layers",
     "refine scene.ply -o x.ply": "give the folder of its pair with --photographs",
     "refine scene.ply -o x.png --photographs room": ".splat, .sog, .glb, .ply",
