@@ -250,7 +250,7 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     def points(metres: float) -> float:
         return metres * _PAPER / _POINT
 
-    for room in drawing.plan.rooms:
+    for room in sorted(drawing.plan.rooms, key=lambda room: room.is_placed):  # what is sure is on top
         dashes = "solid" if room.is_placed else "dashed"
         style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes, "linewidth": points(0.07)}
         axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", **style)

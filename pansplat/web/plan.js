@@ -81,7 +81,7 @@ class Plan {
         const [[x1, y1], [x2, y2]] = ends.map((end) => this.toPlan(this.turned(draw(node, end))));
         group.append(drawSvg("line", { x1, y1, x2, y2 }));
       }
-      svg.append(group);
+      svg[drawnOf(node) ? "prepend" : "append"](group);  // what is sure is on top
       if ([node, ...others].every((each) => named.has(each))) return;  // of a room whose outline is beside it
       [node, ...others].forEach((each) => named.add(each));
       write(node, [x, y], name, scale * width / HEADER.unit);

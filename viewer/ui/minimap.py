@@ -13,7 +13,6 @@ import numpy as np
 import shapely
 from imgui_bundle import imgui
 from jaxtyping import Float
-from shapely.ops import substring
 
 from pansplat.system.descriptions import describe_count
 from pansplat.tours.floor import find_other_storeys
@@ -54,14 +53,16 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, a probable and no known place, and of fades because of poor flights."""
+    """The number of panoramas with a known, probable, approximate and no place, and of fades because of poor flights."""
     flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
     ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
     probable = sum(is_probable(tour, node) for node in range(len(tour)))
     if not alone and not probable:
         return f"{describe_count(len(tour), 'panorama')}{ways}"
-    counts = ((len(tour) - alone - probable, "placed"), (probable, "probably"), (alone, "not placed"))
+    about = len(tour.approximate)
+    counts = (len(tour) - alone - probable, "placed"), (probable, "probably"), (about, "about here")
+    counts = (*counts, (alone - about, "not placed"))
     return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
 
 
@@ -159,8 +160,8 @@ def _draw_dashed(corners: Float[np.ndarray, "corner 2"], scale: float) -> None:
     canvas, color = imgui.get_window_draw_list(), imgui.color_convert_float4_to_u32(_FLOORS[0])
     line = shapely.LinearRing(corners)
     for start in np.arange(0.0, line.length, 2 * _DASH * scale):
-        ends = substring(line, start, min(start + _DASH * scale, line.length)).coords
-        canvas.add_polyline([imgui.ImVec2(x, y) for x, y in ends], color, thickness=1.5 * scale)
+        first, last = (line.interpolate(at) for at in (start, start + _DASH * scale))
+        canvas.add_line((first.x, first.y), (last.x, last.y), color, 1.5 * scale)
 
 
 def _draw_floors(floors: list[Float[np.ndarray, "corner 2"]], colors: tuple[Color, Color], scale: float) -> None:
