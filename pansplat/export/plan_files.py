@@ -100,7 +100,7 @@ def describe_plan(plan: Plan) -> list[str]:
     if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
     if not all(room.is_placed for room in plan.rooms):
-        lines.append("dashed: rooms whose places are not known, or only approximately")
+        lines.append("dashed: rooms whose places are not known; 'about here': only approximately")
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
     walls = describe_count(plan.num_walls, "wall")
@@ -129,10 +129,9 @@ class _Drawing:
     @cached_property
     def _pieces(self) -> list[tuple[int, int]]:
         """World and storey in which each panorama is drawn."""
-        tour, pieces = self.plan.tour, list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
-        return [
-            pieces[tour.approximate[node].beside if node in tour.approximate else node] for node in range(len(tour))
-        ]
+        pieces = list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
+        drawn = self.plan.tour.approximate
+        return [pieces[drawn[node].beside] if node in drawn else piece for node, piece in enumerate(pieces)]
 
     @cached_property
     def _turns(self) -> Float[np.ndarray, "world 2 2"]:

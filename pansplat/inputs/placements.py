@@ -129,8 +129,8 @@ def read_approximate(
             beside, name = stated.between
             if beside in images and name in images and beside != name:
                 unit, (right, forward, yaw) = units.get(beside) or CAMERA_HEIGHT, stated.place
-                place = ApproximatePlace(images[beside], unit * right, unit * forward, yaw, tuple(stated.by))
-                found[images[name]] = place
+                place = images[beside], unit * right, unit * forward, yaw
+                found[images[name]] = ApproximatePlace(*place, tuple(stated.by))
     return found
 
 

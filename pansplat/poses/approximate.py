@@ -66,8 +66,7 @@ def place_linked(
     found: dict[Path, LinkedPlace] = {}
     while free:
         votes = {image: _vote(guesses[image], known) for image in free}
-        image = max(free, key=lambda image: (votes[image][0].probability, len(guesses[image])))
-        best, by = votes[image]
+        image, (best, by) = max(votes.items(), key=lambda vote: vote[1][0].probability)
         if best.probability >= _LEAST_PROBABILITY:
             found[image] = LinkedPlace(best.first, known[best.first].place.inverse().add(best.place), by)
         else:

@@ -230,12 +230,9 @@ def _make_pairs(
         pairs += found.pairs(near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [
-        replace(
-            panorama,
-            placement=Placement("not placed", unplaced[panorama.name], source, about=about.get(panorama.image)),
-        )
-        for panorama in readable
-        if panorama.name in unplaced
+        replace(view, placement=Placement("not placed", unplaced[view.name], source, about=about.get(view.image)))
+        for view in readable
+        if view.name in unplaced
     ]
     first_world = len(content["worlds"])
     return pairs + single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)

@@ -53,7 +53,7 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, probable, approximate and no place, and of fades because of poor flights."""
+    """The number of panoramas with a known, probable, approximate and no place, and of fades on poor flights."""
     flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
     ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
