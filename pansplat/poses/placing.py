@@ -45,7 +45,7 @@ _DOOR = math.radians(16)  # standard deviation of what counts in the direction o
 _LINTEL = 0.6, 0.95  # what is above doors and below the ceiling, fractions of the ceiling's height over the camera
 _WALL_TURN, _GRAZING = math.radians(25), 0.12  # of a surface and its wall; least cosine of a direction and a wall's
 _LEAST_WALL, _THICKNESS = 0.25, 0.08  # distance of a wall with a door, and its thickness, camera heights
-_ALIKE, _NO_DOOR = 7.65, 0.3  # weight of the likeness, as in the check of poses; weight of no common door
+_ALIKE, _NO_DOOR = 7.65, 0.1  # weight of the likeness, as in the check of poses; weight of no common door
 _MOST_SUGGESTIONS = 4  # of a pair
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
