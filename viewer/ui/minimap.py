@@ -60,9 +60,8 @@ def describe_panoramas(tour: TourGraph) -> str:
     probable = sum(is_probable(tour, node) for node in range(len(tour)))
     if not alone and not probable:
         return f"{describe_count(len(tour), 'panorama')}{ways}"
-    about = len(tour.approximate)
-    counts = (len(tour) - alone - probable, "placed"), (probable, "probably"), (about, "about here")
-    counts = (*counts, (alone - about, "not placed"))
+    counts = [(len(tour) - alone - probable, "placed"), (probable, "probably"), (len(tour.approximate), "about here")]
+    counts.append((alone - len(tour.approximate), "not placed"))
     return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
 
 
@@ -144,8 +143,8 @@ class Minimap:
             else:
                 canvas.add_circle_filled((x, y), 4.0 * scale, color)
         here = int(np.linalg.norm(tour.positions - np.asarray(camera.position), axis=1).argmin())
-        place, ahead = np.asarray(camera.position), np.asarray(camera.position) + camera.rotation[:, 2]
-        place, ahead = (tour.draw(here, point @ axes) for point in (place, ahead))
+        points = (np.asarray(camera.position) + ahead * camera.rotation[:, 2] for ahead in (0, 1))
+        place, ahead = (tour.draw(here, point @ axes) for point in points)
         heading = (ahead - place) / max(float(np.linalg.norm(ahead - place)), 1e-6)
         side = np.array((heading[1], -heading[0])) * math.tan(math.radians(min(camera.vertical_fov_degrees, 120)) / 2)
         ends = [to_pixels(place + _VIEW_LENGTH * (heading + sign * side)) for sign in (-1, 1)]
