@@ -100,7 +100,9 @@ def describe_plan(plan: Plan) -> list[str]:
     if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
     if not all(room.is_placed for room in plan.rooms):
-        lines.append("dashed: rooms whose places are not known" + (" or approximate" if plan.tour.approximate else ""))
+        lines.append(
+            "dashed: rooms whose places are not known" + (" or are approximate" if plan.tour.approximate else "")
+        )
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
     walls = describe_count(plan.num_walls, "wall")

@@ -728,8 +728,8 @@ def make_graph(scene: Scene) -> TourGraph:
         links[start].append(Link(names[end], yaw, pitch, text))
     starts = scene.starts or (None,) * count
     placements = {
-        view: Placement("not placed", about=ApproximatePlace(Path(names[beside]), *place))
-        for view, beside, *place in scene.approximate
+        view: Placement("not placed", about=ApproximatePlace(Path(names[beside]), right, forward, yaw))
+        for view, beside, right, forward, yaw in scene.approximate
     }
     panoramas = tuple(
         Panorama(
