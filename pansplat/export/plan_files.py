@@ -100,9 +100,8 @@ def describe_plan(plan: Plan) -> list[str]:
     if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
     if not all(room.is_placed for room in plan.rooms):
-        lines.append(
-            "dashed: rooms whose places are not known" + (" or are approximate" if plan.tour.approximate else "")
-        )
+        about = " or are approximate" if plan.tour.approximate else ""
+        lines.append(f"dashed: rooms whose places are not known{about}")
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
     walls = describe_count(plan.num_walls, "wall")
@@ -207,10 +206,8 @@ class _Drawing:
             circle = shapely.maximum_inscribed_circle(Polygon(corners) if free.is_empty else free)
             (x, y), width = circle.coords[0], 2 * circle.length
             area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
-            rows = [(0.7, room.name), (-0.7, f"{area} m² ± {error}")]
-            if room.panoramas[0] in self.plan.tour.approximate:
-                rows.append((-2.1, "about here"))
-            for row, text in rows:
+            about = [(-2.1, "about here")] if room.panoramas[0] in self.plan.tour.approximate else []
+            for row, text in [(0.7, room.name), (-0.7, f"{area} m² ± {error}"), *about]:
                 size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
                 yield _Text("ROOMS", (x, y + row * size), text, size)
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
