@@ -81,5 +81,6 @@ def _print_estimate(estimate: PoseEstimate) -> None:
     for image, reason in estimate.apart.items():
         print_message("note", f"{estimate.name_of(image)} is in a smaller group: {reason}")
     for image, reason in estimate.unplaced.items():
-        print_message("note", f"{estimate.name_of(image)} has no pose: {reason}")
+        about = " and an approximate place" if image in estimate.approximate else ""
+        print_message("note", f"{estimate.name_of(image)} has no pose{about}: {reason}")
     sys.stdout.flush()

@@ -153,7 +153,7 @@ def write_page(
             InputWarning,
             stacklevel=2,
         )
-        scene = dataclasses.replace(scene, overlaps=(), links=(), starts=())
+        scene = dataclasses.replace(scene, overlaps=(), links=(), starts=(), approximate=())
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
     facts = TourFacts(
         scene if has_cameras else prepared,
@@ -528,7 +528,7 @@ def _describe_plan(
     worlds = tour.worlds or (0,)
     known = [] if plan is None else [*plan.rooms]
     if not known and not floors:
-        return {"worlds": worlds, "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
+        return {"worlds": worlds, "drawn": [], "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
     turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
     turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in (*known, *floors)]
     turns = Plan(tour, tuple(turned), (), math.nan, None, None, 0, 0).turns
@@ -548,7 +548,9 @@ def _describe_plan(
         )
     doors = [] if plan is None else plan.doors
     doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in doors]
-    return {"worlds": worlds, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
+    found = [tour.approximate.get(node) for node in range(len(tour))]
+    drawn = [each and (each.beside, *_round(each.place @ turn - middle), round(each.turn, 5)) for each in found]
+    return {"worlds": worlds, "drawn": drawn, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
 
 
 def _describe_links(

@@ -121,9 +121,11 @@ class PageDoor(_Record):
 
 
 class PagePlan(_Record):
-    """The floor plan: the world of each panorama, and the angle that turns each world."""
+    """The floor plan: the world of each panorama, the angle that turns each world, and where panoramas at approximate
+    places are drawn (`DrawnPlace`): beside which one, to the right and forward, and their turn."""
 
     worlds: tuple[int, ...]
+    drawn: tuple[tuple[int, float, float, float] | None, ...]
     turns: tuple[float, ...]
     rooms: tuple[PageRoom, ...]
     doors: tuple[PageDoor, ...]

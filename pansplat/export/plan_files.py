@@ -96,7 +96,8 @@ def describe_plan(plan: Plan) -> list[str]:
     if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
         lines.append(f"no closed walls around {', '.join(outside)}")
     if not all(room.is_placed for room in plan.rooms):
-        lines.append("dashed: rooms whose places are not known")
+        about = " or are approximate" if plan.tour.approximate else ""
+        lines.append(f"dashed: rooms whose places are not known{about}")
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
     walls = describe_count(plan.num_walls, "wall")
@@ -124,8 +125,10 @@ class _Drawing:
 
     @cached_property
     def _pieces(self) -> list[tuple[int, int]]:
-        """World and storey of each panorama."""
-        return list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
+        """World and storey in which each panorama is drawn."""
+        pieces = list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
+        drawn = self.plan.tour.approximate
+        return [pieces[drawn[node].beside] if node in drawn else piece for node, piece in enumerate(pieces)]
 
     @cached_property
     def _turns(self) -> Float[np.ndarray, "world 2 2"]:
@@ -136,7 +139,11 @@ class _Drawing:
     @cached_property
     def _centers(self) -> Float[np.ndarray, "node 2"]:
         places = self.plan.tour.positions @ self.plan.tour.level_axes[:, (0, 2)]
-        return np.stack([place @ self._turns[world] for place, (world, _) in zip(places, self._pieces, strict=True)])
+        return np.stack([self._turn(place, node) for node, place in enumerate(places)])
+
+    def _turn(self, places: Float[np.ndarray, "*n 2"], node: int) -> Float[np.ndarray, "*n 2"]:
+        """Places around a panorama in its turned world."""
+        return self.plan.tour.draw(node, places) @ self._turns[self._pieces[node][0]]
 
     @cached_property
     def _layout(self) -> tuple[dict[tuple[int, int], Float[np.ndarray, "2"]], tuple[float, float]]:
@@ -148,7 +155,8 @@ class _Drawing:
         order = sorted(set(self._pieces), key=lambda piece: (-worlds.count(piece[0]), piece))
         for piece in order:
             nodes = [node for node, own in enumerate(self._pieces) if own == piece]
-            outlines = [room.outline @ self._turns[piece[0]] for room in self.plan.rooms if room.panoramas[0] in nodes]
+            rooms = [room for room in self.plan.rooms if room.panoramas[0] in nodes]
+            outlines = [self._turn(room.outline, room.panoramas[0]) for room in rooms]
             places = np.concatenate([self._centers[nodes], *outlines])
             boxes.append((places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN))
         lows, sizes = np.array(boxes).transpose(1, 0, 2)
@@ -164,8 +172,7 @@ class _Drawing:
 
     def _draw(self, places: Float[np.ndarray, "n 2"], room: Room) -> Float[np.ndarray, "n 2"]:
         """Places of a room on the sheet."""
-        piece = self._pieces[room.panoramas[0]]
-        return places @ self._turns[piece[0]] + self._layout[0][piece]
+        return self._turn(places, room.panoramas[0]) + self._layout[0][self._pieces[room.panoramas[0]]]
 
     def outline(self, room: Room) -> Float[np.ndarray, "corner 2"]:
         """The corners of a room."""
@@ -195,7 +202,8 @@ class _Drawing:
             circle = shapely.maximum_inscribed_circle(Polygon(corners) if free.is_empty else free)
             (x, y), width = circle.coords[0], 2 * circle.length
             area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
-            for row, text in ((0.7, room.name), (-0.7, f"{area} m² ± {error}")):
+            about = [(-2.1, "about here")] if room.panoramas[0] in self.plan.tour.approximate else []
+            for row, text in [(0.7, room.name), (-0.7, f"{area} m² ± {error}"), *about]:
                 size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
                 yield _Text("ROOMS", (x, y + row * size), text, size)
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -236,7 +244,7 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     def points(metres: float) -> float:
         return metres * _PAPER / _POINT
 
-    for room in drawing.plan.rooms:
+    for room in sorted(drawing.plan.rooms, key=lambda room: room.is_placed):  # what is sure is on top
         dashes = "solid" if room.is_placed else "dashed"
         style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes, "linewidth": points(0.07)}
         axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", **style)

@@ -55,6 +55,7 @@ def keep_gaussians(scene: Scene, kept: Bool[Tensor, "n"], views: Sequence[int] |
         overlaps=tuple((a, b, overlap) for (a, b), overlap in edges.items()),
         links=tuple((new[a], new[b], *rest) for a, b, *rest in scene.links if a in new and b in new),
         starts=tuple(scene.starts[view] for view in chosen) if scene.starts else (),
+        approximate=tuple((new[a], new[b], *rest) for a, b, *rest in scene.approximate if a in new and b in new),
     )
 
 

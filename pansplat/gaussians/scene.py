@@ -29,6 +29,11 @@ Starts = tuple[tuple[float, float] | None, ...]
 """Yaw and pitch, as of a link, of the view of each panorama that a visitor sees first; None if there is none."""
 
 
+ApproximatePlaces = tuple[tuple[int, int, float, float, float], ...]
+"""About where panoramas are drawn on a plan: view, the view that it is beside, to the right and forward of that camera
+in the user's unit, and yaw relative to it (to the right, radians)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Gaussians:
     """3D Gaussians of one scene.
@@ -159,6 +164,7 @@ class Scene:
         overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.graph.TourGraph`.
         links: of a scene of a whole tour: the known directions from one panorama towards another one.
         starts: of a scene of a whole tour: one for each view, or none.
+        approximate: of a scene of a whole tour: of views whose place relative to others is not known.
         joint: whether the Gaussians of all views belong in one image, as other programs draw them. Else those of a view
             show its whole surroundings, and images of single views are blended ("deferred").
         frame: where the world of the Gaussians and cameras is in the user's world, that of files.
@@ -175,6 +181,7 @@ class Scene:
     overlaps: Overlaps = ()
     links: Links = ()
     starts: Starts = ()
+    approximate: ApproximatePlaces = ()
     joint: bool = False
     frame: WorldFrame = USER_FRAME
 

@@ -56,6 +56,7 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
         **({"overlaps": scene.overlaps} if scene.overlaps else {}),
         **({"links": [[*link[:4], _escape(link[4])] for link in scene.links]} if scene.links else {}),
         **({"starts": scene.starts} if any(scene.starts) else {}),
+        **({"approximate": scene.approximate} if scene.approximate else {}),
         **({"joint": True} if scene.joint else {}),
         "runs": runs,
     }
@@ -95,6 +96,7 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
         tuple({pair[:2]: pair for pair in stated.overlaps}.values()),
         tuple(stated.links),
         tuple(stated.starts),
+        tuple(stated.approximate),
         joint=stated.joint is True,
         frame=WorldFrame(origin=stated.origin),
     )
@@ -167,6 +169,7 @@ class _Entry(Struct):
     overlaps: list[tuple[_Camera, _Camera, Annotated[float, Meta(ge=0, le=1)]]] = []
     links: list[tuple[_Camera, _Camera, _Angle, _Angle, str]] = []
     starts: list[tuple[_Angle, _Angle] | None] = []
+    approximate: list[tuple[_Camera, _Camera, _Position, _Position, _Angle]] = []
     joint: Any = False
     runs: list[Any] | None = None
 
@@ -189,7 +192,7 @@ def _parse_entry(text: str | None, path: Path) -> _Entry:
 
 
 def _require_cameras(entry: _Entry) -> None:
-    """Raise an InputError if gains, overlaps, links or starts do not fit the cameras."""
+    """Raise an InputError if what is stated of the cameras does not fit them."""
     cameras, overlaps = len(entry.cam2world), [pair[:2] for pair in entry.overlaps]
     seen = {camera for pair in overlaps for camera in pair}
     fits = {
@@ -197,6 +200,7 @@ def _require_cameras(entry: _Entry) -> None:
         "overlaps": all(a <= b < cameras for a, b in overlaps) and len(seen) in (0, cameras),
         "links": all(a != b and max(a, b) < cameras for a, b, *_ in entry.links),
         "starts": len(entry.starts) in (0, cameras),
+        "approximate": all(a != b and max(a, b) < cameras for a, b, *_ in entry.approximate),
     }
     for name in (name for name, is_fitting in fits.items() if not is_fitting):
         raise InputError(f"comment: needed {name} of its {cameras} cameras, got {getattr(entry, name)!r:.60}")

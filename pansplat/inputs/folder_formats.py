@@ -33,7 +33,16 @@ from pansplat.inputs.pairs import (
     too_many_panoramas,
 )
 from pansplat.inputs.photographs import list_further, with_further
-from pansplat.inputs.placements import Placement, is_by_hand, judge, read_rejected, read_ties
+from pansplat.inputs.placements import (
+    ApproximatePlace,
+    Placement,
+    is_by_hand,
+    judge,
+    read_approximate,
+    read_rejected,
+    read_ties,
+    read_unit,
+)
 from pansplat.inputs.poses import (
     parse_convention,
     parse_numbers,
@@ -84,7 +93,11 @@ def read_pose_file(source: Path, folder: Path, convention: str | None = None) ->
     reasons, known = _read_reasons(content), {view.image for view in panoramas}
     rest = [view for view in dict.fromkeys(tour.values()) if view.image not in known]
     further = rest if tour else list_further(source, folders, panoramas, reasons)
-    unposed = [_explain_unposed(view, reasons, source) for view in further]
+    units = {name: read_unit(content, view.world) for name, view in zip(entries, panoramas, strict=True)}
+    named = tour | {os.path.relpath(view.image, folder).replace(os.sep, "/"): view for view in further}
+    named |= dict(zip(entries, panoramas, strict=True))
+    about = read_approximate(content.get("estimate"), {n: view.image for n, view in named.items()}, units)
+    unposed = [_explain_unposed(view, reasons, about.get(view.image), source) for view in further]
     ranges = _read_ranges(content, source)
     near, far = (
         read_field(content, key, float, source, default)
@@ -149,10 +162,12 @@ def _read_reasons(content: dict[str, Any]) -> dict[str, str]:
     return (reasons if isinstance(reasons, dict) else {}) | dict.fromkeys(rejected, _REJECTED)
 
 
-def _explain_unposed(panorama: Panorama, reasons: dict[str, str], source: Path) -> Panorama:
+def _explain_unposed(
+    panorama: Panorama, reasons: dict[str, str], about: ApproximatePlace | None, source: Path
+) -> Panorama:
     """A panorama beside those of poses.json, with the reason that it states."""
     reason = str(reasons.get(panorama.image.name, f"{POSES} has no pose of it"))
-    placement = Placement("not placed", reason, source, is_rejected=reason == _REJECTED)
+    placement = Placement("not placed", reason, source, is_rejected=reason == _REJECTED, about=about)
     return dataclasses.replace(panorama, placement=placement)
 
 

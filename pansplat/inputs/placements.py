@@ -6,14 +6,39 @@ of its group: the largest part that certain pairs connect.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from msgspec import Struct
+
+from pansplat.errors import InputError
+from pansplat.system.options import CAMERA_HEIGHT
+from pansplat.system.strict_json import convert
+
 State = Literal["placed", "probable", "by hand", "not placed"]
 
 BY_HAND = "by hand"  # value of "placed" in an entry of poses.json
+
+
+@dataclass(frozen=True)
+class ApproximatePlace:
+    """About where a panorama without a pose is. It is drawn on plans; no camera flies there.
+
+    Attributes:
+        beside: picture of the panorama that it is relative to.
+        right, forward: of that camera, level, in the unit of its pose.
+        yaw: heading, radians to the right of that camera's.
+        by: names of the panoramas whose links state it.
+    """
+
+    beside: Path
+    right: float
+    forward: float
+    yaw: float
+    by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -25,12 +50,14 @@ class Placement:
         reason: why there is no pose, or by which pairs it is probable.
         source: the poses.json or the cached estimate that states it; None for other formats.
         is_rejected: whether a user has rejected its pose.
+        about: where one that is not placed may be.
     """
 
     state: State = "placed"
     reason: str = ""
     source: Path | None = None
     is_rejected: bool = False
+    about: ApproximatePlace | None = None
 
 
 PLACED = Placement()
@@ -75,6 +102,44 @@ def read_ties(estimate: Any) -> list[Tie]:
         if isinstance(names, list) and len(names) == 2 and all(isinstance(name, str) for name in names):
             ties.append(Tie(names[0], names[1], pair.get("check") == "certain"))
     return ties
+
+
+def read_unit(content: Mapping[str, Any], world: int) -> float | None:
+    """What is one camera height of the estimated depths in a world of poses.json, if the file states it."""
+    worlds = content.get("worlds")
+    entry = worlds[world] if isinstance(worlds, list) and 0 <= world < len(worlds) else None
+    unit = entry.get("unit") if isinstance(entry, dict) else None
+    return float(unit) if isinstance(unit, (int, float)) and not isinstance(unit, bool) and unit > 0 else None
+
+
+def read_approximate(
+    estimate: Any, images: Mapping[str, Path], units: Mapping[str, float | None]
+) -> dict[Path, ApproximatePlace]:
+    """The approximate places that an estimate states, by image; invalid ones are ignored.
+
+    Args:
+        images: by name.
+        units: of the poses that are known, by name (`read_unit`).
+    """
+    entries = estimate.get("approximate") if isinstance(estimate, Mapping) else None
+    found = {}
+    for entry in entries if isinstance(entries, list) else []:
+        with contextlib.suppress(InputError):
+            stated = convert(entry, _Stated, "approximate")
+            beside, name = stated.between
+            if beside in images and name in images and beside != name:
+                unit, (right, forward, yaw) = units.get(beside) or CAMERA_HEIGHT, stated.place
+                place = images[beside], unit * right, unit * forward, yaw
+                found[images[name]] = ApproximatePlace(*place, tuple(stated.by))
+    return found
+
+
+class _Stated(Struct):
+    """An approximate place as a file states it: the second panorama relative to the first one."""
+
+    between: tuple[str, str]
+    place: tuple[float, float, float]
+    by: list[str] = []
 
 
 def is_by_hand(entry: Any) -> bool:

@@ -25,7 +25,7 @@ from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
-from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties
+from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties, read_unit
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.web_tours import is_scene_of_tour
@@ -114,7 +114,7 @@ class PoseEditor:
 
     def read_unit(self, world: int) -> float | None:
         """Metres that are one camera height of the estimated depths in a world, if the file states it."""
-        return _find_unit(self.read(), world)
+        return read_unit(self.read(), world)
 
     def place(self, poses: Mapping[Path, Float[Array, "4 4"]], world: int | None, unit: float | None = None) -> None:
         """Place panoramas by hand.
@@ -290,6 +290,8 @@ def merge_estimate(
         "pairs": pairs,
         "suggestions": [pair for pair in _list_pairs(old, "suggestions") if not set(pair["between"]) <= read]
         + fresh["suggestions"],
+        "approximate": [pair for pair in _list_pairs(old, "approximate") if not set(pair["between"]) <= read]
+        + fresh["approximate"],
         "unplaced": {name: reason for name, reason in unplaced if name not in files} | fresh["unplaced"],
         "written": " ".join(mark for world, mark in mark_worlds(content).items() if world in own),
     }
@@ -311,7 +313,7 @@ def _find_scales(content: Content, file: Path, group: PoseGroup, anchors: Mappin
             distance = np.linalg.norm(group.poses[pair[0]][:3, 3] - group.poses[pair[1]][:3, 3])
             if distance > 0:
                 ratios.append(float(np.linalg.norm(first - second) / distance))
-        unit, median = _find_unit(content, world), float(np.median(ratios)) if ratios else 0.0
+        unit, median = read_unit(content, world), float(np.median(ratios)) if ratios else 0.0
         if unit is None and not median:
             warnings.warn(
                 f"{file} has only one measured pose, of {list_first(list(own.values()))}, beside new ones, which does "
@@ -355,8 +357,8 @@ def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, P
         world | {"poses": {rename(name): pose for name, pose in world["poses"].items()}} for world in cached["worlds"]
     ]
     renamed = {
-        key: [pair | {"between": [rename(name) for name in pair["between"]]} for pair in cached[key]]
-        for key in ("pairs", "suggestions")
+        key: [pair | {k: [*map(rename, pair[k])] for k in ("between", "by") if k in pair} for pair in cached[key]]
+        for key in ("pairs", "suggestions", "approximate")
     }
     unplaced = {by_name[name].name if name in by_name else name: reason for name, reason in cached["unplaced"].items()}
     return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, **renamed})
@@ -365,13 +367,6 @@ def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, P
 def _is_row(row: Any) -> bool:
     is_list = isinstance(row, list) and len(row) == 4
     return is_list and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in row)
-
-
-def _find_unit(content: Content, world: int) -> float | None:
-    worlds = content.get("worlds")
-    entry = worlds[world] if isinstance(worlds, list) and 0 <= world < len(worlds) else None
-    unit = entry.get("unit") if isinstance(entry, dict) else None
-    return float(unit) if isinstance(unit, (int, float)) and not isinstance(unit, bool) and unit > 0 else None
 
 
 def _find_free_world(content: Content, former: Sequence[Any] = ()) -> int:
@@ -442,7 +437,7 @@ def _take_pairs(content: Content, ties: Sequence[Tie]) -> list[Content]:
 
 
 def _list_pairs(estimate: Content, key: str = "pairs") -> list[Content]:
-    """The valid pairs of an estimate, or its "suggestions", as the file has them."""
+    """The valid pairs of an estimate, or its "suggestions" or "approximate", as the file has them."""
     pairs = estimate.get(key)
     return [pair for pair in pairs if read_ties({"pairs": [pair]})] if isinstance(pairs, list) else []
 

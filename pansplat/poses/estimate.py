@@ -21,6 +21,7 @@ from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
 from pansplat.inputs.placements import Tie, find_holds
 from pansplat.inputs.views import CAMERA_HEIGHT
+from pansplat.poses.approximate import LinkedPlace, place_linked
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap, estimate_depth
@@ -43,7 +44,7 @@ from pansplat.poses.learned import (
 )
 from pansplat.poses.learned import default_weights as default_matcher
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
-from pansplat.poses.placing import DEPTH_HEIGHT, Suggestion, list_suggestions
+from pansplat.poses.placing import DEPTH_HEIGHT, PlanFrame, Suggestion, list_suggestions, make_piece
 from pansplat.poses.tour import Group, IndexPair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
@@ -126,6 +127,7 @@ class PoseEstimate:
         rejected: pairs of them that contradict the others and are not used.
         suggestions: for placing by hand.
         names: of the files, for messages; by default their own.
+        approximate: about where files without a pose are, by links.
     """
 
     images: tuple[Path, ...]
@@ -135,6 +137,7 @@ class PoseEstimate:
     rejected: tuple[IndexPair, ...] = ()
     suggestions: Suggestions = field(default_factory=dict)
     names: Mapping[Path, str] = field(default_factory=dict)
+    approximate: Mapping[Path, LinkedPlace] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<PoseEstimate: {self.summary}>"
@@ -314,9 +317,10 @@ def estimate_poses(
     for position, (reason, other) in tour.unplaced.items():
         partner = "" if other is None else f" (its best pair is with {listed[other]})"
         unplaced[kept[position]] = _describe_mirrored(position, views, placed, listed) or reason + partner
-    suggestions = _suggest(views, relations, [paths[n] for n in kept])
+    files = [paths[n] for n in kept]
+    suggestions = _suggest(views, relations, files)
     if not tour.groups:
-        raise _no_poses(paths, names, unplaced, suggestions)
+        raise _no_poses(paths, names, unplaced, suggestions, _place_linked(views, files, links, ()))
     report_progress("finding the floor", 0.95)
     groups = [
         _finish_group(
@@ -338,7 +342,24 @@ def estimate_poses(
         tuple((kept[i], kept[j]) for i, j in tour.rejected),
         suggestions,
         names,
+        _place_linked(views, files, links, groups),
     )
+
+
+def _place_linked(
+    views: Sequence[_View],
+    files: Sequence[Path],
+    links: Mapping[Path, Mapping[Path, float]],
+    groups: Sequence[PoseGroup],
+) -> dict[Path, LinkedPlace]:
+    """About where the files without a pose are."""
+    pieces = {file: make_piece(view.surroundings, view.axes) for file, view in zip(files, views, strict=True)}
+    worlds = []
+    for group in groups:
+        poses = {file: pose / np.array((1, 1, 1, group.unit)) for file, pose in group.poses.items()}  # camera heights
+        frame = PlanFrame.of_world(np.stack(list(poses.values())), 1.0)
+        worlds.append({file: frame.find_place(pose, pieces[file].upright) for file, pose in poses.items()})
+    return place_linked(pieces, links, worlds)
 
 
 def _suggest(views: Sequence[_View], relations: Mapping[IndexPair, RelativePose], files: Sequence[Path]) -> Suggestions:
@@ -379,6 +400,7 @@ class NoPosesError(InputError):
     Attributes:
         reasons: for each file.
         suggestions: for placing by hand.
+        approximate: about where files are, relative to each other.
     """
 
     def __init__(
@@ -386,11 +408,12 @@ class NoPosesError(InputError):
         reasons: Mapping[Path, str],
         suggestions: Suggestions | None = None,
         names: Mapping[Path, str] | None = None,
+        approximate: Mapping[Path, LinkedPlace] | None = None,
     ) -> None:
         listed = "; ".join(f"{(names or {}).get(path, path.name)}: {reason}" for path, reason in reasons.items())
         advice = "" if suggestions is None else f"; {_ADVICE}"
         super().__init__(f"no poses were found: {listed}{advice}.")
-        self.reasons, self.suggestions = dict(reasons), suggestions or {}
+        self.reasons, self.suggestions, self.approximate = dict(reasons), suggestions or {}, approximate or {}
 
 
 def _no_poses(
@@ -398,8 +421,9 @@ def _no_poses(
     names: Mapping[Path, str],
     reasons: Mapping[int, str],
     suggestions: Suggestions | None = None,
+    approximate: Mapping[Path, LinkedPlace] | None = None,
 ) -> NoPosesError:
-    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, suggestions, names)
+    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, suggestions, names, approximate)
 
 
 def _read_images(

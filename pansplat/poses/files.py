@@ -17,13 +17,14 @@ from pansplat.images.image_files import is_assembled, read_thumbnail
 from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
-from pansplat.inputs.placements import Placement, judge, read_ties
+from pansplat.inputs.placements import Placement, judge, read_approximate, read_ties
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.edit import POSES, find_kept, merge_estimate, name_pictures, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses, fingerprint_estimates
 from pansplat.poses.pose_file import (
     CONVENTION,
+    list_approximate,
     list_pairs,
     list_suggestions,
     make_pose_content,
@@ -154,10 +155,12 @@ def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float)
     try:
         estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height)
     except NoPosesError as error:
-        worlds, summary, unplaced, pairs, suggestions = [], "", error.reasons, [], error.suggestions
+        worlds, summary, unplaced, pairs = [], "", error.reasons, []
+        suggestions, approximate = error.suggestions, error.approximate
     else:
         worlds = [make_world(group, names) for group in estimate.groups]
         summary, unplaced, suggestions = estimate.summary, estimate.unplaced, estimate.suggestions
+        approximate = estimate.approximate
         pairs = list_pairs(estimate, names)
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
@@ -169,6 +172,7 @@ def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float)
         "unreadable": [names[image] for image in unreadable],
         "pairs": pairs,
         "suggestions": list_suggestions(suggestions, names),
+        "approximate": list_approximate(approximate, names),
     }
 
 
@@ -202,6 +206,8 @@ def _make_pairs(
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
         warnings.warn(f"{_describe(panorama, folder)} {outcome}: {reason}", InputWarning, stacklevel=4)
     pairs, ties = [], read_ties(content)
+    units = {name: world["unit"] for world in content["worlds"] for name in world["poses"]}
+    about = read_approximate(content, {name: view.image for name, view in by_name.items()}, units)
     for number, world in enumerate(content["worlds"]):
         placements = judge(list(world["poses"]), ties, (), source)
         for name, placement in placements.items():
@@ -224,9 +230,9 @@ def _make_pairs(
         pairs += found.pairs(near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [
-        replace(panorama, placement=Placement("not placed", unplaced[panorama.name], source))
-        for panorama in readable
-        if panorama.name in unplaced
+        replace(view, placement=Placement("not placed", unplaced[view.name], source, about=about.get(view.image)))
+        for view in readable
+        if view.name in unplaced
     ]
     first_world = len(content["worlds"])
     return pairs + single_view_pairs(single, folder, near, far, siblings=readable, first_world=first_world)

@@ -7,6 +7,7 @@ and cameras of a tour are equally high. Units of a plan are metres; those of a p
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import level_pose, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.pairs import Link, Panorama
-from pansplat.poses.axes import find_axes
+from pansplat.poses.axes import SceneAxes, find_axes
 from pansplat.poses.dense import Comparison, Surroundings, compare
 from pansplat.poses.depth import estimate_depth
 from pansplat.poses.two_view import RelativePose
@@ -39,10 +40,11 @@ POOR_FIT = 0.25  # quality below which a place is doubtful
 _LEAST_OVERLAP = 0.01  # of a comparison that counts
 _LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind (docs/poses.md)
 _LINK_REACH = 1.0, 4.0  # camera heights, of a place by a link
-_DOOR = math.radians(8)  # standard deviation of what counts in the direction of a door
+_DOOR = math.radians(16)  # standard deviation of what counts in the direction of a door
 _LINTEL = 0.6, 0.95  # what is above doors and below the ceiling, fractions of the ceiling's height over the camera
 _WALL_TURN, _GRAZING = math.radians(25), 0.12  # of a surface and its wall; least cosine of a direction and a wall's
 _LEAST_WALL, _THICKNESS = 0.25, 0.08  # distance of a wall with a door, and its thickness, camera heights
+_ALIKE, _NO_DOOR = 7.65, 0.1  # weight of the likeness, as in the check of poses; weight of no common door
 _MOST_SUGGESTIONS = 4  # of a pair
 _NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
@@ -134,25 +136,52 @@ def suggest_by_links(
     return PlanPose(distance * math.sin(yaw), distance * math.cos(yaw), wrap_angle(heading))
 
 
+class Guess(NamedTuple):
+    """A place of one panorama relative to another one, camera heights, with its probability."""
+
+    place: PlanPose
+    probability: float
+
+
 def suggest_through_door(first: Panorama, second: Panorama, pieces: tuple[Piece, Piece]) -> PlanPose | None:
     """The place of the second panorama relative to the first one if their links lead to one door, camera heights.
 
-    Both sides of the wall with the door state the heading and the place. None without links of both, or without walls.
+    It is the most probable one of `list_through_door`. None without links of both, or without walls.
 
     Args:
         first, second: names and links count.
         pieces: of both.
     """
-    doors = []
-    for piece, link in zip(pieces, (_find_link(first, second), _find_link(second, first)), strict=True):
-        door = None if link is None else piece.find_door(_meet_floor(link.yaw, link.pitch, piece.upright)[0])
-        if door is None:
-            return None
-        doors.append(door)
-    there, back = doors
-    right, forward = _THICKNESS * math.sin(there.yaw), _THICKNESS * math.cos(there.yaw)
-    behind = PlanPose(there.right + right, there.forward + forward, wrap_angle(there.yaw + math.pi - back.yaw))
-    return behind.add(PlanPose(-back.right, -back.forward, 0.0))
+    there, back = _find_link(first, second), _find_link(second, first)
+    if there is None or back is None:
+        return None
+    guesses = list_through_door(pieces, ((there.yaw, there.pitch), (back.yaw, back.pitch)))
+    return max(guesses, key=lambda guess: guess.probability).place if guesses else None
+
+
+def list_through_door(
+    pieces: tuple[Piece, Piece], links: tuple[tuple[float, float], tuple[float, float]]
+) -> list[Guess]:
+    """Places of the second piece relative to the first one if a direction in each leads to one door.
+
+    There is one for each wall of both that the door may be in. It is the more probable, the more surfaces around the
+    door are parallel to these walls, and the more alike is what both see.
+
+    Args:
+        links: yaw and pitch of both directions, as of a `Link`.
+    """
+    doors = [piece.find_doors(_meet_floor(*link, piece.upright)[0]) for piece, link in zip(pieces, links, strict=True)]
+    frame, found = PlanFrame(pieces[0].upright, 1.0), []
+    for (there, share), (back, other) in itertools.product(*doors):
+        right, forward = _THICKNESS * math.sin(there.yaw), _THICKNESS * math.cos(there.yaw)
+        behind = PlanPose(there.right + right, there.forward + forward, wrap_angle(there.yaw + math.pi - back.yaw))
+        place = behind.add(PlanPose(-back.right, -back.forward, 0.0))
+        pose = frame.make_pose(place, pieces[1].upright, 0.0)
+        rotation, translation = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+        seen = compare(pieces[0].surroundings, pieces[1].surroundings, rotation, translation)
+        found.append((place, share * other * math.exp(_ALIKE * seen.weight * seen.likeness)))
+    total = _NO_DOOR + sum(weight for _, weight in found)
+    return [Guess(place, weight / total) for place, weight in found]
 
 
 def _find_link(start: Panorama, end: Panorama) -> Link | None:
@@ -211,31 +240,31 @@ class Piece:
         chosen = (heights > _LINTEL[0]) & (heights < _LINTEL[1]) & (np.abs(normals[:, 1]) < 0.35)
         return places[chosen][:, (0, 2)], np.arctan2(normals[chosen, 0], normals[chosen, 2])
 
-    def find_door(self, yaw: float) -> PlanPose | None:
-        """Where a direction meets a wall, and the yaw of the wall's normal; None if there is none.
-
-        It is the wall that most of the surfaces around the direction, above doors, are parallel to.
-        """
-        if self.wall_yaw is None or self._lintels is None:
-            return None
+    def find_doors(self, yaw: float) -> list[tuple[PlanPose, float]]:
+        """For each wall that a direction may meet: where, with the yaw of the wall's normal; and the share of the
+        surfaces around the direction, above doors, that are parallel to it."""
+        if self._lintels is None:
+            return []
         places, normals = self._lintels
+        wall_yaw = find_wall_yaw(normals.tolist()) if self.wall_yaw is None else self.wall_yaw
+        if wall_yaw is None:
+            return []
         turns = np.angle(np.exp(1j * (np.arctan2(*places.T) - yaw)))
         weights = np.exp(-0.5 * (turns / _DOOR) ** 2)
         found = []
-        for normal in self.wall_yaw + math.pi / 2 * np.arange(4):
+        for normal in wall_yaw + math.pi / 2 * np.arange(4):
             cosine = math.cos(yaw - normal)
             own = (np.abs(np.angle(np.exp(1j * (normals - normal)))) < _WALL_TURN) & (np.abs(turns) < 3 * _DOOR)
             if cosine > _GRAZING and own.any():
                 offsets = places[own] @ (math.sin(normal), math.cos(normal))
                 order = offsets.argsort()
                 sums = weights[own][order].cumsum()
-                distance = offsets[order][np.searchsorted(sums, 0.5 * sums[-1])]
-                if distance > _LEAST_WALL:
-                    found.append((sums[-1], distance / cosine, normal))
-        if not found:
-            return None
-        _, reach, normal = max(found)
-        return PlanPose(reach * math.sin(yaw), reach * math.cos(yaw), wrap_angle(float(normal)))
+                reach = offsets[order][np.searchsorted(sums, 0.5 * sums[-1])] / cosine
+                if reach * cosine > _LEAST_WALL:
+                    place = PlanPose(reach * math.sin(yaw), reach * math.cos(yaw), wrap_angle(float(normal)))
+                    found.append((place, float(sums[-1])))
+        total = sum(weight for _, weight in found)
+        return [(place, weight / total) for place, weight in found]
 
     def draw_outline(self, place: PlanPose, unit: float) -> Float[Array, "azimuth 2"]:
         """The outline on the plan, metres; a small circle if there is none."""
@@ -254,9 +283,13 @@ def read_piece(image: Path) -> Piece:
     grey = cv2.cvtColor((pixels * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     axes = find_axes(grey)
     pixels = cv2.resize(pixels, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
-    depth = estimate_depth(pixels, axes.axes[0] if axes.has_down else None)
-    wall = depth.rotation.T @ axes.axes[1]
-    return Piece(Surroundings(pixels, depth), math.atan2(wall[0], wall[2]) if axes.has_walls else None)
+    return make_piece(Surroundings(pixels, estimate_depth(pixels, axes.axes[0] if axes.has_down else None)), axes)
+
+
+def make_piece(surroundings: Surroundings, axes: SceneAxes) -> Piece:
+    """The piece of a panorama whose depth and axes are estimated."""
+    wall = surroundings.depth.rotation.T @ axes.axes[1]
+    return Piece(surroundings, math.atan2(wall[0], wall[2]) if axes.has_walls else None)
 
 
 @dataclass(frozen=True, eq=False)

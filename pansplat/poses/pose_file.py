@@ -13,6 +13,7 @@ import numpy as np
 
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.placements import is_by_hand
+from pansplat.poses.approximate import LinkedPlace
 from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
 
 CONVENTION = "cam2world opencv"
@@ -28,6 +29,7 @@ def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
             "pairs": list_pairs(estimate, names),
             "suggestions": list_suggestions(estimate.suggestions, names),
+            "approximate": list_approximate(estimate.approximate, names),
         },
     )
 
@@ -81,6 +83,19 @@ def list_suggestions(suggestions: Suggestions, names: Mapping[Path, str]) -> lis
             "places": [[round(x, 4) for x in (*s.place, s.log_odds)] for s in own],
         }
         for (first, second), own in suggestions.items()
+    ]
+
+
+def list_approximate(places: Mapping[Path, LinkedPlace], names: Mapping[Path, str]) -> list[dict[str, Any]]:
+    """Approximate places of the second panorama of a pair relative to the first one, and whose links state them."""
+    return [
+        {
+            "between": [names[found.beside], names[image]],
+            "place": [round(x, 4) for x in found.place],
+            "by": [names[other] for other in found.by],
+            "sure": False,
+        }
+        for image, found in places.items()
     ]
 
 

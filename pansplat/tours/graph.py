@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
 from pansplat.inputs.pairs import FAR, NEAR, Link, Pair, Panorama
+from pansplat.inputs.placements import PLACED, ApproximatePlace, Placement
 from pansplat.system.components import label_components
 from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.tours.edges import find_walls
@@ -41,6 +43,20 @@ _MIN_BASELINE = 0.03  # of a scene of two views, as a fraction of far; depth is 
 _MAX_STARTS = 10_000  # of a walk, divided by the number of nodes
 _LINKED_FADE = 0.5  # cost of a fade along a link, as a fraction of far
 _UNLINKED_FADE = 2.5  # cost of another fade, as a factor, so that two fades along links cost less
+
+
+class DrawnPlace(NamedTuple):
+    """Where a plan shows a panorama at an approximate place.
+
+    Attributes:
+        beside: the panorama whose world it is shown in.
+        place: of its camera, to the right and forward of the tour's level axes, metres.
+        turn: of what is around it, radians to the right.
+    """
+
+    beside: int
+    place: Float[np.ndarray, "2"]
+    turn: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +136,29 @@ class TourGraph:
     def is_placed(self, node: int) -> bool:
         """Whether the place of a node relative to another one is known."""
         return len(self.overlaps) > 0 and self.worlds.count(self.worlds[node]) > 1
+
+    @cached_property
+    def approximate(self) -> dict[int, DrawnPlace]:
+        """The nodes that are not placed and have an approximate place."""
+        number, found = {panorama.image: node for node, panorama in enumerate(self.panoramas)}, {}
+        for node, panorama in enumerate(self.panoramas):
+            about = panorama.placement.about
+            beside = None if about is None or self.is_placed(node) else number.get(about.beside)
+            if about is not None and beside is not None and self.panoramas[beside].placement.about is None:
+                yaw, own = (
+                    math.atan2(*(self.level_axes.T @ self.cam2world[n, :3, 2].numpy())[::2]) for n in (beside, node)
+                )
+                offset = np.array((about.right, about.forward)) / self.panoramas[beside].frame.unit
+                place = self.positions[beside] @ self.level_axes[:, (0, 2)] + offset @ _turn_plan(yaw)
+                found[node] = DrawnPlace(beside, place, wrap_angle(yaw + about.yaw - own))
+        return found
+
+    def draw(self, node: int, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where a plan shows places around a node, to the right and forward of the level axes."""
+        drawn = self.approximate.get(node)
+        if drawn is None:
+            return places
+        return drawn.place + (places - self.positions[node] @ self.level_axes[:, (0, 2)]) @ _turn_plan(drawn.turn)
 
     def with_walls(self, walls: Iterable[Edge]) -> TourGraph:
         """The graph with further walls in place of edges; a node without another edge gets a self-edge."""
@@ -470,6 +509,11 @@ class TourGraph:
         return ways, previous
 
 
+def _turn_plan(yaw: float) -> Float[np.ndarray, "2 2"]:
+    """The rotation to the right of rows (right, forward), which is applied from the right."""
+    return np.array(((math.cos(yaw), -math.sin(yaw)), (math.sin(yaw), math.cos(yaw))))
+
+
 def _find_shortest_ways(
     costs: Float[np.ndarray, "node node"],
 ) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
@@ -607,6 +651,11 @@ def merge_scenes(tour: TourGraph, load: Callable[[ViewNumbers], Scene], max_view
             (a, b, wrap_angle(link.yaw), wrap_angle(link.pitch), link.text) for (a, b), link in tour.links.items()
         ),
         starts=list_starts(tour.panoramas),
+        approximate=tuple(
+            (node, drawn.beside, about.right, about.forward, wrap_angle(about.yaw))
+            for node, drawn in tour.approximate.items()
+            if (about := tour.panoramas[node].placement.about) is not None
+        ),
     )
     return dataclasses.replace(
         merged, overlaps=tour.with_walls(find_walls(merged, range(len(tour)), tour.overlaps)).list_overlaps()
@@ -664,6 +713,7 @@ def select_views(scene: Scene, views: ViewNumbers) -> Scene:
         overlaps=(),
         links=(),
         starts=(),
+        approximate=(),
     )
 
 
@@ -677,9 +727,20 @@ def make_graph(scene: Scene) -> TourGraph:
     for start, end, yaw, pitch, text in scene.links:
         links[start].append(Link(names[end], yaw, pitch, text))
     starts = scene.starts or (None,) * count
+    placements = {
+        view: Placement("not placed", about=ApproximatePlace(Path(names[beside]), right, forward, yaw))
+        for view, beside, right, forward, yaw in scene.approximate
+    }
     panoramas = tuple(
         Panorama(
-            names[k], Path(names[k]), pose, title=titles[k], links=tuple(links[k]), start=starts[k], frame=scene.frame
+            names[k],
+            Path(names[k]),
+            pose,
+            title=titles[k],
+            links=tuple(links[k]),
+            start=starts[k],
+            placement=placements.get(k, PLACED),
+            frame=scene.frame,
         )
         for k, pose in enumerate(scene.cam2world.double())
     )

@@ -1,5 +1,6 @@
 // The floor plan: outlines of rooms, doors, panoramas and the camera from above, the longest wall horizontal. It shows the
-// world of the panorama at the camera; rooms of other worlds, whose places are unknown, are a list.
+// world of the panorama at the camera, with rooms at approximate places dashed; rooms of other worlds, whose places are unknown,
+// are a list.
 
 import { placeNames } from "./choices.js";
 import { byId, make } from "./dom.js";
@@ -12,6 +13,18 @@ const PLAN_MARGIN = 32;        // pixels
 const LARGEST_PLAN_SCALE = 60; // pixels for a metre
 const STOREY = 1.5;            // metres: rooms with a larger difference in height from the camera are faint
 const PLAN_TEXT = 13;          // pixels, height of a room's name, at most
+
+const flat = (position) => [0, 2].map((k) => dot(column(HEADER.level, k), position));
+const drawnOf = (node) => HEADER.plan.drawn[node] || null;  // of a panorama at an approximate place
+const worldOf = (node) => HEADER.plan.worlds[drawnOf(node)?.[0] ?? node];
+
+// Where the plan shows a place around a panorama, to the right and forward (TourGraph.draw).
+function draw(node, place) {
+  const drawn = drawnOf(node);
+  if (!drawn) return place;
+  const [, right, forward, turn] = drawn, [c, s] = [Math.cos(turn), Math.sin(turn)], [x, z] = minus(place, flat(HEADER.spots[node].position));
+  return [right + c * x + s * z, forward - s * x + c * z];
+}
 
 class Plan {
   constructor() {
@@ -34,12 +47,14 @@ class Plan {
     return [c * right - s * forward, s * right + c * forward];
   }
 
-  placeOf = (node) => this.turned([0, 2].map((k) => dot(column(HEADER.level, k), HEADER.spots[node].position)));
+  placeOf = (node) => this.turned(draw(node, flat(HEADER.spots[node].position)));
 
   make(world) {
     this.turn = HEADER.plan.turns[world];
-    const { worlds, rooms, doors } = HEADER.plan, nodes = [...worlds.keys()].filter((node) => worlds[node] === world);
-    const outlines = rooms.map((room) => worlds[room.nodes[0]] === world ? room.outline.map((corner) => this.turned(corner)) : null);
+    const { worlds, rooms, doors } = HEADER.plan, nodes = [...worlds.keys()].filter((node) => worldOf(node) === world);
+    const outlines = rooms.map(({ nodes: [node], outline }) => {
+      return worldOf(node) === world ? outline.map((corner) => this.turned(draw(node, corner))) : null;
+    });
     const places = [...nodes.map((node) => this.placeOf(node)), ...outlines.flatMap((outline) => outline || [])];
     const size = byId("drawing").clientWidth, sides = [0, 1].map((k) => places.map((place) => place[k]));
     const [low, high] = [Math.min, Math.max].map((choose) => sides.map((side) => choose(...side)));
@@ -60,13 +75,13 @@ class Plan {
     };
     rooms.forEach(({ name, nodes: [node, ...others], label: [right, forward, width], hasWalls }, k) => {
       if (!outlines[k]) return;
-      const group = add(node, drawSvg("g", {})), [x, y] = this.toPlan(this.turned([right, forward]));
-      group.append(drawSvg("polygon", { class: hasWalls ? "" : "open", points: outlines[k].map(this.toPlan).join(" ") }));
+      const group = add(node, drawSvg("g", {})), [x, y] = this.toPlan(this.turned(draw(node, [right, forward])));
+      group.append(drawSvg("polygon", { class: drawnOf(node) ? "about" : hasWalls ? "" : "open", points: outlines[k].map(this.toPlan).join(" ") }));
       for (const { ends } of doors.filter(({ room }) => room === k)) {
-        const [[x1, y1], [x2, y2]] = ends.map((end) => this.toPlan(this.turned(end)));
+        const [[x1, y1], [x2, y2]] = ends.map((end) => this.toPlan(this.turned(draw(node, end))));
         group.append(drawSvg("line", { x1, y1, x2, y2 }));
       }
-      svg.append(group);
+      svg[drawnOf(node) ? "prepend" : "append"](group);  // what is sure is on top
       if ([node, ...others].every((each) => named.has(each))) return;  // of a room whose outline is beside it
       [node, ...others].forEach((each) => named.add(each));
       write(node, [x, y], name, scale * width / HEADER.unit);
@@ -76,7 +91,7 @@ class Plan {
     const buttons = nodes.map((node) => {
       const button = make("button", ""), [left, top] = this.toPlan(this.placeOf(node));
       if (!named.has(node)) write(node, [left, top], HEADER.spots[node].name, 80);
-      button.title = button.ariaLabel = `Go to ${HEADER.spots[node].name}`;
+      button.title = button.ariaLabel = `Go to ${HEADER.spots[node].name}${drawnOf(node) ? " (about here)" : ""}`;
       button.style.transform = `translate(${left - 22}px, ${top - 22}px)`;
       button.onclick = ({ detail, clientX, clientY }) => goTo(detail ? this.nearest(nodes, clientX, clientY) : node);
       return add(node, button);
@@ -88,12 +103,14 @@ class Plan {
       if (place) ["x", "y"].forEach((axis, i) => names[k].element.setAttribute(axis, place[i]));
       else names[k].element.remove();
     });
-    byId("elsewhere").replaceChildren(make("p", "", "Not on the plan"), ...[...worlds.keys()].filter((node) => !nodes.includes(node)).map((node) => {
+    const list = (title, listed) => listed.length === 0 ? [] : [make("p", "", title), ...listed.map((node) => {
       const button = make("button", "", HEADER.spots[node].name);
       button.onclick = () => goTo(node);
       return add(node, button);
-    }));
-    byId("elsewhere").hidden = nodes.length === worlds.length;
+    })];
+    const dashed = list("Dashed: about here", nodes.filter(drawnOf)), others = [...worlds.keys()].filter((node) => !nodes.includes(node));
+    byId("elsewhere").replaceChildren(...dashed, ...list("Not on the plan", others));
+    byId("elsewhere").hidden = byId("elsewhere").children.length === 0;
     this.world = world;
   }
 
@@ -105,7 +122,7 @@ class Plan {
 
   // The world of the panorama at the camera; for one alone, the one that is shown, at first the largest.
   chooseWorld() {
-    const { worlds } = HEADER.plan, sizeOf = (world) => worlds.filter((each) => each === world).length;
+    const worlds = HEADER.plan.worlds.map((_, node) => worldOf(node)), sizeOf = (world) => worlds.filter((each) => each === world).length;
     const largest = worlds.reduce((best, world) => sizeOf(world) > sizeOf(best) ? world : best);
     const isAlone = sizeOf(worlds[state.here]) === 1 && sizeOf(largest) > 1;
     return isAlone ? this.world === null ? largest : this.world : worlds[state.here];
@@ -115,13 +132,14 @@ class Plan {
     if (!this.isOpen) return;
     const world = this.chooseWorld(), heightOf = (position) => dot(column(HEADER.level, 1), position) / HEADER.unit;
     if (world !== this.world) this.make(world);
-    const place = this.turned([0, 2].map((k) => dot(column(HEADER.level, k), camera.position))), [x, y] = this.toPlan(place);
-    this.camera.setAttribute("visibility", HEADER.plan.worlds[state.here] === world ? "visible" : "hidden");
-    this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${(camera.yaw - this.turn) / DEGREE})`);
-    const [floor, ...others] = [state.here, ...this.marks.map(([node]) => node)].map((node) => heightOf(HEADER.spots[node].position));
+    const [x, y] = this.toPlan(this.turned(draw(state.here, flat(camera.position)))), turn = drawnOf(state.here)?.[3] ?? 0;
+    this.camera.setAttribute("visibility", worldOf(state.here) === world ? "visible" : "hidden");
+    this.camera.setAttribute("transform", `translate(${x} ${y}) rotate(${(camera.yaw + turn - this.turn) / DEGREE})`);
+    const floorOf = (node) => heightOf(HEADER.spots[drawnOf(node)?.[0] ?? node].position);
+    const [floor, ...others] = [state.here, ...this.marks.map(([node]) => node)].map(floorOf);
     this.marks.forEach(([node, element], k) => {
-      const isElsewhere = HEADER.plan.worlds[node] !== world;
-      element.classList.toggle("faint", !isElsewhere && HEADER.plan.worlds[state.here] === world && Math.abs(others[k] - floor) > STOREY);
+      const isElsewhere = worldOf(node) !== world;
+      element.classList.toggle("faint", !isElsewhere && worldOf(state.here) === world && Math.abs(others[k] - floor) > STOREY);
       if (node === state.here && element.tagName === "BUTTON") element.setAttribute("aria-current", "location");
       else element.removeAttribute("aria-current");
     });

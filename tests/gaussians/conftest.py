@@ -26,6 +26,7 @@ def _make_scene(count: int = 40, degree: int = 1, *, seed: int = 0, spread: floa
     poses[1, :3, 3] = torch.tensor([1 / 3, -2e-7, 12345.678901234567], dtype=torch.float64)
     names, gains, overlaps = ("à\n.jpg", "b c.png"), ((1.25, 1.0, 0.9), (0.8, 1.0, 1 / 0.9)), ((0, 0, 1), (1, 1, 0.5))
     tour = {"overlaps": overlaps, "links": ((1, 0, -3.0, 0.25, "à <b>"),), "starts": (None, (1.0, -0.5))}
+    tour |= {"approximate": ((1, 0, 1.5, -2.0, 0.3),)}
     return Scene(gaussians, poses, 0.45, 10.0, names, "sweep", height=256, gains=gains, **tour)
 
 

@@ -7,10 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import pansplat
 from pansplat.errors import InputError
 from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.placements import ApproximatePlace
+from pansplat.poses.approximate import LinkedPlace
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.files import write_poses
@@ -41,6 +44,9 @@ def _estimate(images, **options) -> PoseEstimate:
         {pair: _relation(value) for pair, value in odds.items() if max(pair) < len(images)},
         (),
         {(images[0], images[5]): (Suggestion(PlanPose(1.0, 2.0, 0.5), -1.5),)} if len(images) > 5 else {},
+        approximate={images[5]: LinkedPlace(images[0], PlanPose(1.0, 2.0, 0.5), (images[1],))}
+        if len(images) > 5
+        else {},
     )
 
 
@@ -244,6 +250,27 @@ def test_suggestions_are_kept_from_the_cache_to_the_file(folder: Path):
             (folder / "a.png", folder / "f.png"): (Suggestion(PlanPose(1.0, 2.0, 0.5), -1.5),)
         }
         editor.place({folder / "e.png": np.eye(4)}, 0)
+
+
+def test_an_approximate_place_is_kept_from_the_cache_to_the_file_and_a_place_by_hand_replaces_it(folder: Path):
+    file, place = folder / "a.png", (1.6, 3.2, 0.5)  # one camera height is 1.6 m
+    assert _load(folder)["f"].placement.about == ApproximatePlace(file, *place, ("b",))
+    write_poses(_estimate([folder / f"{name}.png" for name in NAMES]), folder / "poses.json")
+    content = _content(folder)
+    stated = {"between": ["a.png", "f.png"], "place": [1.0, 2.0, 0.5], "by": ["b.png"], "sure": False}
+    assert content["estimate"]["approximate"] == [stated] and "f.png" not in content["poses"]
+    views = _load(folder)
+    assert views["f"].placement.about == ApproximatePlace(file, *place, ("b.png",))
+    assert views["f"].placement.state == "not placed" and torch.equal(views["f"].cam2world, torch.eye(4).double())
+    faulty = [3, {"between": ["a.png"]}, stated | {"place": ["x", 0, 0]}, stated | {"between": ["f.png", "f.png"]}]
+    content["estimate"]["approximate"] = [*faulty, {"between": ["gone.png", "f.png"], "place": [0, 0, 0]}]
+    (folder / "poses.json").write_text(json.dumps(content))
+    assert _load(folder)["f"].placement.about is None
+    write_poses(_estimate([folder / f"{name}.png" for name in NAMES]), folder / "poses.json")
+    assert _load(folder)["f"].placement.about is not None
+    _edit(folder).place({folder / "f.png": np.eye(4)}, 0)
+    placement = _load(folder)["f"].placement
+    assert placement.state == "by hand" and placement.about is None
 
 
 def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(folder: Path):

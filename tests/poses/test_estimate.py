@@ -23,6 +23,7 @@ from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.estimate import (
     PoseEstimate,
+    PoseGroup,
     _find_file,
     _is_mirrored,
     _match,
@@ -141,6 +142,19 @@ def _view(features: Features, small: np.ndarray, learned: LearnedFeatures = NO_L
     depth = DepthMap(np.zeros((48, 96)), np.full((48, 96), 1.0), np.eye(3))
     axes = SceneAxes(np.eye(3), False, False)
     return _View(features, features, learned, axes, small, Surroundings(np.dstack((small,) * 3), depth))
+
+
+def test_approximate_places_are_sought_from_places_in_camera_heights(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two panoramas in a world of 1.6 m a camera height, the second is 3.2 m ahead and looks to the right."""
+    given, files = MagicMock(return_value={}), (Path("a"), Path("b"), Path("c"))
+    monkeypatch.setattr(estimate_module, "place_linked", given)
+    poses = {Path("a"): np.eye(4), Path("b"): np.eye(4)}
+    poses[Path("b")][:3] = ((0, 0, 1, 0), (0, 1, 0, 0), (-1, 0, 0, 3.2))
+    views, links = [_view(_no_features(1), np.zeros((4, 8), np.float32))] * 3, {Path("a"): {Path("c"): 0.3}}
+    estimate_module._place_linked(views, files, links, [PoseGroup(poses, 0.4, 8.0, 0.0, "a test", 1.6)])
+    pieces, passed, (world,) = given.call_args.args
+    assert tuple(pieces) == files and passed is links
+    assert world[Path("a")] == pytest.approx((0, 0, 0)) and world[Path("b")] == pytest.approx((0, 2, math.pi / 2))
 
 
 def _no_features(count: int) -> Features:

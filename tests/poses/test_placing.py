@@ -17,6 +17,7 @@ from pansplat.poses.placing import (
     PlanFrame,
     PlanPose,
     list_suggestions,
+    list_through_door,
     measure_fit,
     snap,
     suggest_by_links,
@@ -180,7 +181,11 @@ def test_links_to_one_door_suggest_the_place_behind_its_wall(look_around, door, 
     assert found.distance(truth) < 0.05 and found.turn_between(truth) < 1e-6
     assert suggest_through_door(views[1], views[0], tuple(pieces[::-1])).distance(truth.inverse()) < 0.05
     assert suggest_through_door(views[0], replace(views[1], links=()), tuple(pieces)) is None
-    assert suggest_through_door(views[0], views[1], (pieces[0], Piece(pieces[1].surroundings, None))) is None
+    bare = suggest_through_door(views[0], views[1], (pieces[0], Piece(pieces[1].surroundings, None)))
+    assert bare.distance(truth) < 0.05, "walls without edges are those of the surfaces"
+    every = list_through_door(tuple(pieces), tuple((view.links[0].yaw, view.links[0].pitch) for view in views))
+    assert max(every, key=lambda guess: guess.probability).place == found
+    assert 0.5 < sum(guess.probability for guess in every) < 1
 
 
 def _tilt(angle: float) -> np.ndarray:

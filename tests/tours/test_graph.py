@@ -13,6 +13,7 @@ from synthetic_scenes import make_balls
 
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.placements import ApproximatePlace, Placement
 from pansplat.tours import graph
 from pansplat.tours.graph import TourGraph, _find_shortest_ways, find_tours
 from pansplat.tours.route import plan_route
@@ -274,6 +275,26 @@ def test_a_merged_scene_of_parts_has_their_links_titles_and_gains(home):
     assert [panorama.label for panorama in again.panoramas] == list(scene.names)
     part = graph.select_views(scene, (3,))
     assert part.names == (title,) and part.links == part.starts == part.overlaps == ()
+
+
+def test_a_panorama_at_an_approximate_place_is_drawn_there_and_stays_where_no_camera_flies(home):
+    """p3 is 1 m to the right and 2 m ahead of p2, and is turned by a quarter to the right."""
+    about = ApproximatePlace(home.panoramas[2].image, 1.0, 2.0, math.pi / 2, ("p2",))
+    panoramas = list(home.panoramas)
+    panoramas[3] = dataclasses.replace(panoramas[3], placement=Placement("not placed", about=about))
+    tour = dataclasses.replace(home, panoramas=tuple(panoramas))
+    scene = graph.merge_scenes(tour, lambda views: Scene(empty_gaussians(), tour.cam2world[list(views)], 1.0, 2.0))
+    for drawn in (tour, graph.make_graph(scene)):
+        assert list(drawn.approximate) == [3] and drawn.approximate[3].beside == 2
+        axes = drawn.level_axes[:, (0, 2)]
+        places = drawn.positions[3] @ axes + np.array(((0, 0), (0, 1), (1, 0)))  # the camera, ahead, to the right
+        assert np.allclose(drawn.draw(3, places), drawn.positions[2] @ axes + np.array(((1, 2), (2, 2), (1, 1))))
+        assert np.array_equal(drawn.draw(4, places), places)
+        assert drawn.parts == home.parts and not drawn.is_placed(3)
+        assert np.allclose(drawn.positions, home.positions) and drawn.overlaps == home.overlaps
+    assert graph.select_views(scene, (3,)).approximate == ()
+    joined = dataclasses.replace(tour, overlaps=home.overlaps | {(2, 3): 0.5})
+    assert joined.approximate == {}, "one that is placed is where it is"
 
 
 def test_next_nodes_lead_along_the_cheapest_walk(comb, home):

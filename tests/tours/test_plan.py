@@ -224,6 +224,25 @@ def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path:
         assert any(line.startswith(expected) for line in text.split("\n")), expected
 
 
+def test_a_room_at_an_approximate_place_is_dashed_where_its_neighbour_has_it(tmp_path: Path) -> None:
+    """The hall is in a world of its own, and then half a metre farther to the right than in one world."""
+    house = _make_house(WALLS, CAMERAS)
+    scene = dataclasses.replace(house, overlaps=((0, 1, 0.5), (2, 2, 1.0)), approximate=((2, 0, 6.0, 0.5, 0.0),))
+    drawings = [_Drawing(_plan(each)) for each in (house, scene)]
+    offsets = [
+        np.subtract(*(drawing.outline(room).mean(axis=0) for room in drawing.plan.rooms)) for drawing in drawings
+    ]
+    turn = np.array(((math.cos(drawings[1].plan.turns[0]),), (math.sin(drawings[1].plan.turns[0]),)))[:, 0]
+    assert offsets[1] - offsets[0] == pytest.approx(-0.5 * turn, abs=0.02)
+    assert drawings[1].panoramas[2] - drawings[1].panoramas[0] == pytest.approx(
+        drawings[0].panoramas[2] - drawings[0].panoramas[0] + 0.5 * turn, abs=2e-3
+    )
+    write_plan(scene, tmp_path / "plan.svg")
+    text, known = (tmp_path / "plan.svg").read_text(), _plan(scene).rooms
+    assert [room.is_placed for room in known] == [True, False] and "stroke-dasharray" in text
+    assert _read_svg(tmp_path / "plan.svg")[1].count("about here") == 1
+
+
 def test_the_picture_is_the_drawing(tmp_path: Path) -> None:
     write_plan(_make_house(WALLS, CAMERAS), tmp_path / "plan.png")
     image = cv2.imread(str(tmp_path / "plan.png"))

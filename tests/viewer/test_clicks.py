@@ -769,6 +769,23 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
 
 
 @pytest.mark.filterwarnings("ignore:.*has no pose of")
+def test_a_photograph_at_an_approximate_place_is_on_the_plan_beside_its_neighbour(placing_user, tmp_path):
+    user, content = placing_user, json.loads((tmp_path / "poses.json").read_text())
+    before = user.panels.minimap.nodes
+    content["estimate"]["approximate"] = [{"between": ["a.png", "d.png"], "place": [0.0, -1.0, 0.0]}]
+    (tmp_path / "poses.json").write_text(json.dumps(content))
+    user.viewer.open(tmp_path)
+    user.draw_until(lambda: user.viewer.tour is not None and user.viewer.tour.tour.approximate, "approximate place")
+    user.settle()
+    assert describe_panorama(user.viewer.tour.tour, 3) == "d (about here)"
+    assert describe_panoramas(user.viewer.tour.tour) == "2 placed, 1 probably, 1 about here"
+    a, b, _, d = np.array(user.panels.minimap.nodes)
+    assert abs(d[0] - a[0]) < 1 and d[1] > a[1] + 10, "it is behind a"
+    distances = [np.linalg.norm(np.subtract(nodes[3], nodes[0])) for nodes in (before, (a, b, _, d))]
+    assert distances[1] / np.linalg.norm(b - a) < distances[0] / np.linalg.norm(np.subtract(before[1], before[0]))
+
+
+@pytest.mark.filterwarnings("ignore:.*has no pose of")
 def test_a_probable_photograph_is_rejected_restored_and_the_rejection_undone(placing_user, tmp_path):
     user = placing_user
     tour, before, pixels = user.viewer.scenes.tour.tour, (tmp_path / "poses.json").read_bytes(), user.read_window()

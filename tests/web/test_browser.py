@@ -1412,6 +1412,39 @@ def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, f
 
 
 @pytest.mark.slow
+def test_a_room_at_an_approximate_place_is_dashed_on_the_plan_of_another_world(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "flat.html", size=(640, 480)) as page:
+        level = np.array(page.run("HEADER.level"))
+        positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
+        offsets = np.array(((-1, -1), (2, -1), (2, 1), (-1, 1)))  # around the camera: to the right, ahead
+        room = {"name": "bath", "nodes": [2], "outline": (positions[2] + offsets).tolist(), "hasWalls": True}
+        room["label"] = [*room["outline"][0], 2]
+        place = positions[0] + (5, 0)
+        page.run(f"HEADER.plan.turns.fill(0); HEADER.plan.rooms = [{json.dumps(room)}]; HEADER.plan.doors = []")
+        page.run(f"HEADER.plan.drawn[2] = [0, {place[0]}, {place[1]}, Math.PI / 2]")
+        page.page.keyboard.press("m")
+        page.settle()
+        drawing = page.page.query_selector("#drawing").bounding_box()
+        boxes = [each.bounding_box() for each in page.page.query_selector_all("#drawing button")]
+        centers = np.array([(box["x"] + 22 - drawing["x"], box["y"] + 22 - drawing["y"]) for box in boxes])
+        assert len(boxes) == 3 and centers[2, 1] == pytest.approx(centers[0, 1], abs=0.6)
+        scale = (centers[2, 0] - centers[0, 0]) / 5
+        points = page.page.get_attribute("#plan polygon.about", "points").replace(",", " ").split()
+        turned = offsets[:, ::-1] * (
+            1,
+            1,
+        )  # a quarter to the right: what was ahead is on the right, and down is positive
+        assert np.array(points, float).reshape(-1, 2) == pytest.approx(centers[2] + scale * turned, abs=0.6)
+        assert page.page.inner_text("#elsewhere").startswith("Dashed: about here")
+        assert page.page.locator("#elsewhere button").all_inner_texts() == ["</script><b>hall", "attic"]
+        arrow = "document.querySelector('#plan path').getAttribute('transform').match(/-?\\d[-.e\\d]*/g).map(Number)"
+        page.run("pansplat.goTo(3, { jump: true })")
+        page.wait(f"document.querySelector('#elsewhere [aria-current]') && Math.abs({arrow}[0] - {centers[2, 0]}) < 1")
+        yaw = page.run("pansplat.getPose().yaw")
+        assert page.run(arrow)[2] % 360 == pytest.approx((yaw + 90) % 360, abs=0.1) and page.messages == []
+
+
+@pytest.mark.slow
 def test_with_reduced_motion_the_camera_jumps(chromium: Any, folder: Path) -> None:
     with opened(chromium, folder / "house.html", script=FRAMES, reduced_motion="reduce") as page:
         spots = page.run("HEADER.spots.map((spot) => spot.position)")

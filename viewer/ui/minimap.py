@@ -1,7 +1,7 @@
 """The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama.
 
-Panoramas without a known place are squares, those that are only probably placed are rings. Other storeys than that of
-the camera are faint.
+Panoramas without a known place are squares, those that are only probably placed are rings, floors at approximate places
+are dashed. Other storeys than that of the camera are faint.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import shapely
 from imgui_bundle import imgui
 from jaxtyping import Float
 
@@ -24,6 +25,7 @@ SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0
 _VIEW_LENGTH = 1.0  # metres, of the camera's field of view
 _PLAN_MARGIN = 0.5  # metres, around the panoramas and floors
+_DASH = 5.0  # pixels, of an outline
 
 Color = tuple[float, float, float, float]
 
@@ -45,20 +47,21 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
     """The label of a panorama, and how sure its place is."""
     label, placement = tour.panoramas[node].label, tour.panoramas[node].placement
     if not tour.is_placed(node):
-        return f"{label} (not placed)"
+        return f"{label} ({'about here' if node in tour.approximate else 'not placed'})"
     notes = {"probable": " (probably placed)", "by hand": " (placed by hand)"}
     return label + notes.get(placement.state, "")
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, a probable and no known place, and of fades because of poor flights."""
+    """The number of panoramas with a known, probable, approximate and no place, and of fades on poor flights."""
     flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
     ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
     probable = sum(is_probable(tour, node) for node in range(len(tour)))
     if not alone and not probable:
         return f"{describe_count(len(tour), 'panorama')}{ways}"
-    counts = ((len(tour) - alone - probable, "placed"), (probable, "probably"), (alone, "not placed"))
+    counts = [(len(tour) - alone - probable, "placed"), (probable, "probably"), (len(tour.approximate), "about here")]
+    counts.append((alone - len(tour.approximate), "not placed"))
     return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
 
 
@@ -81,8 +84,10 @@ class Minimap:
         """Draw the plan into the current imgui window; returns the panorama that was clicked."""
         scale, tour = imgui.get_style().font_scale_dpi, scenes.tour
         others = find_other_storeys(tour, np.asarray(camera.position))
-        corners = [outline.corners for outline in scenes.outlines.values()]
-        places = np.concatenate([tour.positions @ tour.level_axes[:, (0, 2)], *corners])
+        floors = {node: tour.draw(node, outline.corners) for node, outline in scenes.outlines.items()}
+        cameras = tour.positions @ tour.level_axes[:, (0, 2)]
+        nodes = np.stack([tour.draw(node, place) for node, place in enumerate(cameras)])
+        places = np.concatenate([nodes, *floors.values()])
         low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
         factor, corner = SIZE * scale / float((high - low).max()), imgui.get_cursor_screen_pos()
 
@@ -94,8 +99,11 @@ class Minimap:
         imgui.dummy((width, height))
         hovered = imgui.is_item_hovered()
         for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
-            shown = [outline.corners for node, outline in scenes.outlines.items() if (node in others) == is_other]
-            _draw_floors([to_pixels(corners) for corners in shown], colors, scale)
+            shown = [node for node in floors if (node in others) == is_other and node not in tour.approximate]
+            _draw_floors([to_pixels(floors[node]) for node in shown], colors, scale)
+        for node in tour.approximate.keys() & floors.keys():
+            _draw_dashed(to_pixels(floors[node]), scale)
+        self.nodes = [tuple(pixel) for pixel in to_pixels(nodes).tolist()]
         self._draw_marks(scenes, others, camera, to_pixels, scale)
         if not hovered:
             return None
@@ -119,7 +127,6 @@ class Minimap:
     ) -> None:
         tour, canvas = scenes.tour, imgui.get_window_draw_list()
         axes = tour.level_axes[:, (0, 2)]
-        self.nodes = [tuple(pixel) for pixel in to_pixels(tour.positions @ axes).tolist()]
         colors = [imgui.color_convert_float4_to_u32(color) for color in _COLORS]
         for a, b in tour.overlaps:
             canvas.add_line(self.nodes[a], self.nodes[b], colors[2], scale)
@@ -135,15 +142,25 @@ class Minimap:
                 canvas.add_circle((x, y), 4.0 * scale, color, 0, 1.8 * scale)
             else:
                 canvas.add_circle_filled((x, y), 4.0 * scale, color)
-        place, rotation = np.asarray(camera.position) @ axes, camera.rotation
-        heading = rotation[:, 2] @ axes
-        heading = heading / max(float(np.linalg.norm(heading)), 1e-6)
+        here = int(np.linalg.norm(tour.positions - np.asarray(camera.position), axis=1).argmin())
+        points = (np.asarray(camera.position) + ahead * camera.rotation[:, 2] for ahead in (0, 1))
+        place, ahead = (tour.draw(here, point @ axes) for point in points)
+        heading = (ahead - place) / max(float(np.linalg.norm(ahead - place)), 1e-6)
         side = np.array((heading[1], -heading[0])) * math.tan(math.radians(min(camera.vertical_fov_degrees, 120)) / 2)
         ends = [to_pixels(place + _VIEW_LENGTH * (heading + sign * side)) for sign in (-1, 1)]
         at = to_pixels(place)
         for end in ends:
             canvas.add_line(tuple(at.tolist()), tuple(end.tolist()), colors[3], 1.5 * scale)
         canvas.add_circle_filled(tuple(at.tolist()), 4.5 * scale, colors[3])
+
+
+def _draw_dashed(corners: Float[np.ndarray, "corner 2"], scale: float) -> None:
+    """Draw the outline of a floor with dashes of equal length."""
+    canvas, color = imgui.get_window_draw_list(), imgui.color_convert_float4_to_u32(_FLOORS[0])
+    line = shapely.LinearRing(corners)
+    for start in np.arange(0.0, line.length, 2 * _DASH * scale):
+        first, last = (line.interpolate(at) for at in (start, start + _DASH * scale))
+        canvas.add_line((first.x, first.y), (last.x, last.y), color, 1.5 * scale)
 
 
 def _draw_floors(floors: list[Float[np.ndarray, "corner 2"]], colors: tuple[Color, Color], scale: float) -> None:

@@ -151,6 +151,8 @@ class Panels:
             state.target = state.target if clicked is None else clicked
             if any(is_probable(tour.tour, node) for node in range(len(tour.tour))):
                 imgui.text_disabled("ring: probably placed")
+            if tour.tour.approximate:
+                imgui.text_disabled("dashed: about here")
         imgui.set_next_item_width(-1)
         if imgui.begin_combo("##visit", describe_panoramas(tour.tour)):
             for node in range(len(tour.tour)):
