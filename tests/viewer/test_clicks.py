@@ -774,11 +774,13 @@ def test_a_photograph_at_an_approximate_place_is_on_the_plan_beside_its_neighbou
     before = user.panels.minimap.nodes
     content["estimate"]["approximate"] = [{"between": ["a.png", "d.png"], "place": [0.0, -1.0, 0.0]}]
     (tmp_path / "poses.json").write_text(json.dumps(content))
-    user.viewer.open(tmp_path)
-    user.draw_until(lambda: user.viewer.tour is not None and user.viewer.tour.tour.approximate, "approximate place")
+    user.viewer.scenes.search(tmp_path)
+    user.draw_until(
+        lambda: user.viewer.scenes.tour is not None and user.viewer.scenes.tour.tour.approximate, "approximate place"
+    )
     user.settle()
-    assert describe_panorama(user.viewer.tour.tour, 3) == "d (about here)"
-    assert describe_panoramas(user.viewer.tour.tour) == "2 placed, 1 probably, 1 about here"
+    assert describe_panorama(user.viewer.scenes.tour.tour, 3) == "d (about here)"
+    assert describe_panoramas(user.viewer.scenes.tour.tour) == "2 placed, 1 probably, 1 about here"
     a, b, _, d = np.array(user.panels.minimap.nodes)
     assert abs(d[0] - a[0]) < 1 and d[1] > a[1] + 10, "it is behind a"
     distances = [np.linalg.norm(np.subtract(nodes[3], nodes[0])) for nodes in (before, (a, b, _, d))]

@@ -563,7 +563,15 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
     def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
         if not entry.views:
             return load_house(replace(entry, views=(0, 1), pair=house.make_pair((0, 1)), max_views=64))
-        facts = {"outlines": {}, "views": (), "outlooks": (), "clearances": (), "walls": [], "poor": ()} | found
+        facts = {
+            "outlines": {},
+            "views": (),
+            "outlooks": (),
+            "clearances": (),
+            "hidden": (),
+            "walls": [],
+            "poor": (),
+        } | found
         loaded = replace(load_house(entry), facts=SimpleNamespace(**facts))
         if len(entry.views) == 4:
             show(replace(loaded, is_final=False))
