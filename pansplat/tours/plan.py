@@ -336,6 +336,11 @@ def _trace_outline(sight: _Sight, lines: _Lines, unit: float) -> Polygon | None:
     outline = np.array(corners).reshape(-1, 2)
     if len(outline) < 3 or not _is_along(outline, lines, unit):
         return None
+    # Behind an opening no end of a wall may be seen: it ends where the farthest surfaces are.
+    axes = np.stack((lines.normals[0], (-lines.normals[0, 1], lines.normals[0, 0])))
+    low, high = (find(sight.walls @ axes.T, axis=0) for find in (np.nanmin, np.nanmax))
+    margin = _LARGEST_ERROR * unit
+    outline = np.clip(outline @ axes.T, low - margin, high + margin) @ axes
     polygon = shapely.make_valid(Polygon(sight.center + outline))
     return _choose_piece(polygon.buffer(0), sight.center)
 

@@ -20,7 +20,7 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.plan import Plan
+from pansplat.tours.plan import Plan, _Lines, _rays, _Sight, _trace_outline
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -182,6 +182,20 @@ def test_the_plan_does_not_depend_on_the_unit_of_length() -> None:
     metres, other = _plan(scene), _plan(scene.scaled(1024.0))
     for a, b in zip(metres.rooms, other.rooms, strict=True):
         assert np.allclose(a.outline * 1024, b.outline, atol=0.5)
+
+
+def test_a_corridor_whose_end_is_no_wall_ends_at_the_farthest_surface() -> None:
+    right, ahead, left, behind = 1.6, 1.5, -2.0, -1.5
+    lines = _Lines(np.array(((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0))), np.array((right, ahead, left, behind)))
+    reach = lines.offsets / (_rays() @ lines.normals.T)
+    reach = np.where(reach > 0, reach, np.inf).min(axis=1)
+    corridor = slice(11, 47)  # degrees: along the right wall, through the wall ahead
+    reach[corridor] = np.minimum(right / _rays()[corridor, 0], 4.3)
+    walls = reach[:, None] * _rays()
+    outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
+    assert outline is not None
+    assert outline.bounds[:3] == pytest.approx((left, behind, right), abs=1e-6)
+    assert 4.3 < outline.bounds[3] < 4.3 + 0.35 * 1.5, "the right wall meets the first ray of the corridor after 8 m"
 
 
 def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
