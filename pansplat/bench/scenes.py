@@ -145,4 +145,5 @@ def _paint(
     palette = torch.rand(int(surface.max()) + 1, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     stripes = torch.sin(9 * points).prod(dim=1) + 0.5 * torch.sin(70 * points).prod(dim=1)
     grain = 0.05 * torch.randn(len(points), 3, generator=generator, dtype=torch.float64)
+    torch.randn(len(points), 3, generator=generator)  # so that the room stays that of earlier figures
     return (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()[:, None]
