@@ -51,7 +51,7 @@ from pansplat.system.files import is_written
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys, choose_camera_height
+from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
@@ -425,8 +425,7 @@ def _describe_scene(
     """The numbers of a page, without those of single Gaussians; a part of `PageHeader`."""
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
-    usual_height = choose_camera_height(facts.heights, scene.far)
-    heights = [height or usual_height for height in facts.heights]
+    heights = facts.usual_heights
     starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     marks = positions + np.outer(heights, level[:, 1])
     spots = [

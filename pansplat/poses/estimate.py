@@ -582,7 +582,7 @@ def _relate_views(
 
     def look_up(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
-        key = hash_parts(first.key, second.key, f"{links[pair]}")
+        key = hash_parts(first.key, second.key, str(links[pair]))
         return cache.get("pair", key, lambda: relate(pair))
 
     groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs

@@ -19,6 +19,7 @@ from pansplat.tours.floor import FloorOutline, choose_camera_height, find_camera
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers, make_graph
 from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
 from pansplat.tours.plan import Door, Plan, Room, make_plan
+from pansplat.tours.surfaces import OPAQUE, locate_surfaces
 
 Value = TypeVar("Value")
 
@@ -98,6 +99,13 @@ class TourFacts:
         """Heights of the cameras over the floor, metres; None where a view shows no floor."""
         return [find_camera_height(self.scene, view, self.tour.level_axes) for view in range(len(self.views))]
 
+    @cached_property
+    def usual_heights(self) -> list[float]:
+        """The heights of all cameras of the tour, metres; the median of those that are known for the others."""
+        known = dict(zip(self.views, self.heights, strict=True))
+        usual = choose_camera_height(self.heights, self.scene.far)
+        return [known.get(node) or usual for node in range(len(self.tour))]
+
     @_stored
     def _floors(self) -> list[FloorOutline | None]:
         return [find_floor_outline(self.scene, view, self.tour.level_axes) for view in range(len(self.views))]
@@ -121,15 +129,12 @@ class TourFacts:
     @_stored
     def hidden(self) -> list[list[int]]:
         """For each view, the panoramas whose places on the floor surfaces hide (`find_hidden`)."""
-        known, usual = (
-            dict(zip(self.views, self.heights, strict=True)),
-            choose_camera_height(self.heights, self.scene.far),
-        )
-        heights = [known.get(node) or usual for node in range(len(self.tour))]
-        marks = self.tour.positions + np.outer(heights, self.level[:, 1])
-        offsets = [(marks - self.tour.positions[node]) @ self.level for node in self.views]
-        found = [find_hidden(self.scene, k, self.level, own) for k, own in enumerate(offsets)]
-        return [[other for other in own if other != node] for node, own in zip(self.views, found, strict=True)]
+        marks, hidden = self.tour.positions + np.outer(self.usual_heights, self.level[:, 1]), []
+        for view, node in enumerate(self.views):
+            places = locate_surfaces(self.scene, view, self.level, min_opacity=OPAQUE)
+            found = find_hidden(places, (marks - self.tour.positions[node]) @ self.level)
+            hidden.append([other for other in found if other != node])
+        return hidden
 
     @_stored
     def walls(self) -> list[Edge]:

@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import OPAQUE, locate_surfaces
 
 BINS = 24  # of the horizon; the first one begins at the yaw -pi
 _ROWS = 12  # of clearances, from above to below
 _NEAREST = 0.1  # quantile of the distances of surfaces in one direction
 _ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and below the horizon
-_OPAQUE = 0.5  # least opacity of a surface
 _WALL = 1.2  # metres, the distance of surfaces below which a view faces a wall
 _WINDOW = 3  # bins of a view, 45 degrees
 _CONE = math.cos(math.radians(2))  # around the direction of a mark
@@ -29,7 +28,7 @@ def measure_outlook(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) ->
         view: number of the camera.
         level: axes of a level camera, as columns right, down and forward.
     """
-    offsets = locate_surfaces(scene, view, level, min_opacity=_OPAQUE)
+    offsets = locate_surfaces(scene, view, level, min_opacity=OPAQUE)
     distances = np.linalg.norm(offsets, axis=1)
     is_ahead = np.abs(offsets[:, 1]) < _ELEVATION * distances
     bins = ((np.arctan2(offsets[:, 0], offsets[:, 2]) / (2 * math.pi) + 0.5) * BINS).astype(int) % BINS
@@ -43,7 +42,7 @@ def measure_clearance(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) 
     Args:
         scene, view, level: see `measure_outlook`.
     """
-    offsets = locate_surfaces(scene, view, level, min_opacity=_OPAQUE)
+    offsets = locate_surfaces(scene, view, level, min_opacity=OPAQUE)
     distances, cells = np.linalg.norm(offsets, axis=1), _find_cells(offsets)
     order = np.lexsort((distances, cells))
     first, last = (np.searchsorted(cells[order], np.arange(_ROWS * BINS), side) for side in ("left", "right"))
@@ -95,26 +94,17 @@ def find_turned(
     return (views < _WALL) & (counts > 0), (((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi, 0.0)
 
 
-def find_hidden(
-    scene: Scene, view: int, level: Float[np.ndarray, "3 3"], marks: Float[np.ndarray, "mark 3"]
-) -> list[int]:
-    """Which marks most surfaces in their directions are in front of.
-
-    Args:
-        scene, view, level: see `measure_outlook`.
-        marks: places relative to the camera, in the axes `level`.
-    """
-    places = locate_surfaces(scene, view, level, min_opacity=_OPAQUE)
-    return [number for number, mark in enumerate(marks) if is_hidden(places, mark)]
-
-
-def is_hidden(places: Float[np.ndarray, "n 3"], mark: Float[np.ndarray, "3"]) -> bool:
-    """Whether most surfaces in the direction of a mark are in front of it.
+def find_hidden(places: Float[np.ndarray, "n 3"], marks: Float[np.ndarray, "mark 3"]) -> list[int]:
+    """The marks that most surfaces in their directions are in front of.
 
     Args:
         places: of the surfaces relative to the camera (`locate_surfaces`).
-        mark: relative to the camera, in the same axes.
+        marks: relative to the camera, in the same axes.
     """
-    distances, length = np.linalg.norm(places, axis=1), float(np.linalg.norm(mark))
-    ahead = distances[places @ mark > _CONE * distances * length]
-    return len(ahead) > 0 and float(np.mean(ahead < _IN_FRONT * length)) > _HIDING
+    distances, found = np.linalg.norm(places, axis=1), []
+    for number, mark in enumerate(marks):
+        length = float(np.linalg.norm(mark))
+        ahead = distances[places @ mark > _CONE * distances * length]
+        if len(ahead) > 0 and float(np.mean(ahead < _IN_FRONT * length)) > _HIDING:
+            found.append(number)
+    return found

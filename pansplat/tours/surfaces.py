@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
 
-_OPAQUE = 0.5  # least opacity of the surfaces at the ends of an edge
+OPAQUE = 0.5  # least opacity of the surfaces that hide and block
 
 
 def locate_surfaces(
@@ -63,5 +63,5 @@ def locate_ends(
     inside = [(a, b) for a, b in edges if a != b and a in view and b in view]
     ends = {node for edge in inside for node in edge}
     positions = scene.cam2world[:, :3, 3].double().cpu().numpy()
-    surfaces = {node: locate_surfaces(scene, view[node], np.eye(3), min_opacity=_OPAQUE) for node in ends}
+    surfaces = {node: locate_surfaces(scene, view[node], np.eye(3), min_opacity=OPAQUE) for node in ends}
     return inside, surfaces, {node: positions[view[node]] for node in ends}
