@@ -44,25 +44,34 @@ export function setPose(pose) {
 export function toggleDoll() {
   const { doll } = state;
   if (doll.isOn) visit(doll.node, doll.heading);
+  else if (doll.isDue) setTouring(false);
   else enterDoll();
 }
 
-// Flies out of the panorama at the camera.
+// Flies out of the panorama at the camera, once the Gaussians and the atlas are there.
 function enterDoll() {
   const { doll } = state;
-  if (state.headset.session || !state.sorted) return;
+  if (state.headset.session) return;
   setTouring(false);
   doll.node = nearestNode(camera.position);
   if (!findHouse()) {
     say(byId("no-doll").textContent);
     return;
   }
-  if (!byId("atlas")?.complete) return;
+  setDollDue(!canDraw());
+  if (doll.isDue) return;
   takeStill();
   setDoll(true);
   camera.roll = 0;
   Object.assign(doll, { fov: camera.fov, heading: { yaw: camera.yaw, pitch: camera.pitch } });
   flyDoll(frameDoll([innerWidth, innerHeight]));
+}
+
+const canDraw = () => state.sorted !== null && byId("atlas")?.complete === true;
+
+function setDollDue(value) {
+  state.doll.isDue = value;
+  byId("doll").setAttribute("aria-pressed", value || state.doll.isOn);
 }
 
 // Flies into a panorama, and ends there; by default it looks where the camera looks from outside.
@@ -100,6 +109,7 @@ function flyDoll(target, then = () => {}) {
 }
 
 export function advanceDollFlight(now) {
+  if (state.doll.isDue && canDraw()) enterDoll();
   const way = state.doll.flight;
   if (!way || isWaiting()) return;
   way.began ??= now;
@@ -233,6 +243,7 @@ export function advanceRoute(seconds) {
 }
 
 export function setTouring(value) {
+  setDollDue(false);  // another way replaces it
   state.isTouring = value && HEADER.spots.length > 1;
   if (state.isTouring && state.doll.isOn) jumpTo(state.doll.node);
   byId("play").setAttribute("aria-pressed", state.isTouring);

@@ -27,7 +27,7 @@ let lastFrame = 0;
 // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
 export function isSettled() {
   const isDrawn = state.headset.session !== null || !state.isDirty && state.drawnScale === 1, tolerance = state.headset.session ? SORT_DISTANCE : 0;
-  const isMoving = [state.flight, state.route, state.doll.flight, state.fade, state.still].some((each) => each !== null);
+  const isMoving = state.doll.isDue || [state.flight, state.route, state.doll.flight, state.fade, state.still].some((each) => each !== null);
   return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && state.sorted.views.every((view) => shown[view] === 1);
 }
 

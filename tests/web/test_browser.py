@@ -84,6 +84,18 @@ CLOCK = """((waiting, time) => {
     };
 })([], 1e5);"""
 FRAME_MS = 30  # of it; the page keeps its resolution
+# Messages to the worker wait while `isHolding`, until `release`.
+HOLD = """
+    held = [], isHolding = () => false;
+    window.Worker = class extends Worker {
+        postMessage(message) {
+            if (isHolding(message)) held.push(message);
+            else super.postMessage(message);
+            window.worker = this;
+        }
+    };
+    release = () => { isHolding = () => false; held.splice(0).forEach((message) => worker.postMessage(message)); };
+"""
 
 
 def new_context(chromium: Any, **options: Any) -> Any:
@@ -307,13 +319,40 @@ def room() -> Scene:
     return Scene(full_lattice_room(128), make_room_cameras(2), 0.1, 10.0, names=("west", "east"), height=128)
 
 
+@pytest.fixture(scope="module")
+def room_photographs(room: Scene, take_photographs: Callable[..., list[Pair]]) -> list[Pair]:
+    return take_photographs(room, 256)
+
+
+@pytest.fixture(scope="module")
+def room_page(room: Scene, room_photographs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("room") / "doll.html"
+    write_page(room, path, photographs=room_photographs)
+    return path
+
+
+def test_the_dolls_house_opens_when_the_gaussians_have_arrived(chromium: Any, room_page: Path) -> None:
+    holding = HOLD + "isHolding = ({ chunk }) => chunk;"
+    with opened(chromium, room_page, script=holding, is_stepped=True) as page:  # of which the photograph is shown
+        page.page.emulate_media(reduced_motion="reduce")
+        start = page.camera
+        for is_due, press in ((True, "KeyO"), (False, "KeyO"), (True, "KeyO"), (False, "KeyR"), (True, "KeyO")):
+            page.page.keyboard.press(press)
+            page.run(f"step({FRAME_MS})")
+            assert page.page.get_attribute("#doll", "aria-pressed") == str(is_due).lower()
+            assert page.camera == start and page.run("pansplat.isSettled()") is False
+        page.run("release()")
+        page.wait("pansplat.camera.fov === 45 && pansplat.isSettled()")
+        assert page.page.get_attribute("#doll", "aria-pressed") == "true"
+        assert page.messages == []
+
+
 def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_back_inside(
-    chromium: Any, room: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
+    chromium: Any, room: Scene, room_photographs: list[Pair], room_page: Path
 ) -> None:
-    photographs, rooms = take_photographs(room, 256), find_rooms(TourFacts(room))
-    write_page(room, tmp_path / "doll.html", photographs=photographs)
+    photographs, rooms = room_photographs, find_rooms(TourFacts(room))
     origin, cameras = room.cam2world[:, :3, 3].mean(0).numpy(), room.cam2world[:, :3, 3].numpy()
-    with opened(chromium, tmp_path / "doll.html") as page:
+    with opened(chromium, room_page) as page:
         page.page.emulate_media(reduced_motion="reduce")
         start, level = page.camera, np.array(page.run("HEADER.level"))
         page.page.keyboard.press("KeyO")
@@ -803,17 +842,6 @@ def test_a_gaussian_takes_28_bytes_of_textures_that_every_device_has(chromium: A
         assert [code for code, *_ in page.run("textures.slice(4, 7)")] == targets
 
 
-HOLD = """
-    held = [], isHolding = () => false;
-    window.Worker = class extends Worker {
-        postMessage(message) {
-            if (isHolding(message)) held.push(message);
-            else super.postMessage(message);
-            window.worker = this;
-        }
-    };
-    release = () => { isHolding = () => false; held.splice(0).forEach((message) => worker.postMessage(message)); };
-"""
 IN_PARTS = "let views = new Set(); isHolding = ({ chunk, view }) => chunk && views.add(view).size > 1;"
 
 
