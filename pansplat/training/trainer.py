@@ -41,7 +41,7 @@ from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, describe_measures, validate
 
 _EXTRA_STEPS = 10  # of the learning-rate schedule beyond the last step, as in the official code
-_TINY_SECONDS = 1.2  # of a step of `tiny` on two cores (docs/training.md)
+_TINY_SECONDS = 0.7  # of a step of `tiny` on two cores (docs/training.md)
 _COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
 
 

@@ -44,7 +44,7 @@ export function setPose(pose) {
 export function toggleDoll() {
   const { doll } = state;
   if (doll.isOn) visit(doll.node, doll.heading);
-  else if (doll.isDue) setTouring(false);
+  else if (doll.isDue) setDollDue(false);
   else enterDoll();
 }
 
@@ -58,7 +58,7 @@ function enterDoll() {
     say(byId("no-doll").textContent);
     return;
   }
-  setDollDue(!canDraw());
+  setDollDue(!canShowDoll());
   if (doll.isDue) return;
   takeStill();
   setDoll(true);
@@ -67,7 +67,7 @@ function enterDoll() {
   flyDoll(frameDoll([innerWidth, innerHeight]));
 }
 
-const canDraw = () => state.sorted !== null && byId("atlas")?.complete === true;
+const canShowDoll = () => state.sorted !== null && byId("atlas")?.complete === true;
 
 function setDollDue(value) {
   state.doll.isDue = value;
@@ -109,7 +109,7 @@ function flyDoll(target, then = () => {}) {
 }
 
 export function advanceDollFlight(now) {
-  if (state.doll.isDue && canDraw()) enterDoll();
+  if (state.doll.isDue && canShowDoll()) enterDoll();
   const way = state.doll.flight;
   if (!way || isWaiting()) return;
   way.began ??= now;
