@@ -42,7 +42,8 @@ def find_link_ring(
 ) -> Float[np.ndarray, "3"] | None:
     """From a camera to the ring of a link, in world axes; None without a link, or if it is vertical.
 
-    It is where the link meets the floor, 1 to 3 m away, but before a wall.
+    It is where the link meets the floor, 1 to 3 m away, and before a wall that is not nearer: below the camera nobody
+    would see it.
 
     Args:
         tour: the graph.
@@ -56,7 +57,7 @@ def find_link_ring(
     down = tour.level_axes[:, 1]
     fall = float(direction @ down)
     distance = height * float(direction @ along) / fall if fall > 0 else _RING_METRES[1]
-    return min(max(distance, _RING_METRES[0]), _RING_METRES[1], _BEFORE_WALL * wall) * along + height * down
+    return float(np.clip(min(distance, _BEFORE_WALL * wall), *_RING_METRES)) * along + height * down
 
 
 def _find_level_direction(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
