@@ -13,7 +13,8 @@ from pansplat.tours.graph import TourGraph
 
 _WAY_METRES = 0.7  # that the camera goes along a link, before the fade
 _RING_METRES = (1.0, 3.0)  # distance of a link's ring
-_BEFORE_WALL = 0.8  # of the distance of a wall, at most
+_BEFORE_WALL = 0.8  # of the distance of a wall
+_NEAREST_WALL = 1.3  # metres of a ring before a wall, at least: a camera that looks down by 20 degrees shows it
 _MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical
 
 
@@ -42,8 +43,7 @@ def find_link_ring(
 ) -> Float[np.ndarray, "3"] | None:
     """From a camera to the ring of a link, in world axes; None without a link, or if it is vertical.
 
-    It is where the link meets the floor, 1 to 3 m away, and before a wall that is not nearer: below the camera nobody
-    would see it.
+    It is where the link meets the floor, 1 to 3 m away; before a wall, but for a near one not nearly below the camera.
 
     Args:
         tour: the graph.
@@ -57,7 +57,8 @@ def find_link_ring(
     down = tour.level_axes[:, 1]
     fall = float(direction @ down)
     distance = height * float(direction @ along) / fall if fall > 0 else _RING_METRES[1]
-    return float(np.clip(min(distance, _BEFORE_WALL * wall), *_RING_METRES)) * along + height * down
+    free = max(_BEFORE_WALL * wall, _NEAREST_WALL)
+    return float(np.clip(min(distance, free), *_RING_METRES)) * along + height * down
 
 
 def _find_level_direction(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
