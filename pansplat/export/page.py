@@ -55,7 +55,7 @@ from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_arrival, find_bin, find_turned
+from pansplat.tours.outlook import choose_arrival, find_turned
 from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
 
@@ -574,7 +574,7 @@ def _describe_links(
         way = find_way_along_link(tour, start, end)
         if way is not None:
             yaw, _ = find_angles(tour.level_axes.T @ way / np.linalg.norm(way))
-            ring = find_link_ring(tour, start, end, heights[start], outlooks[start][find_bin(yaw)] or math.inf)
+            ring = find_link_ring(tour, start, end, heights[start], outlooks[start])
             assert ring is not None
             if is_elsewhere or end in spots[start]["hidden"]:
                 found["mark"] = _round(position + ring)

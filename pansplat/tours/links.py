@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from pansplat.inputs.pairs import Link
 from pansplat.tours.graph import TourGraph
+from pansplat.tours.outlook import find_bin
 
 _WAY_METRES = 0.7  # that the camera goes along a link, before the fade
 _RING_METRES = (1.0, 3.0)  # distance of a link's ring
@@ -39,7 +40,7 @@ def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarr
 
 
 def find_link_ring(
-    tour: TourGraph, start: int, end: int, height: float, wall: float = math.inf
+    tour: TourGraph, start: int, end: int, height: float, outlook: Float[np.ndarray, "bin"] | None = None
 ) -> Float[np.ndarray, "3"] | None:
     """From a camera to the ring of a link, in world axes; None without a link, or if it is vertical.
 
@@ -49,7 +50,7 @@ def find_link_ring(
         tour: the graph.
         start, end: nodes.
         height: of the camera over the floor, metres.
-        wall: distance of what stands in the direction of the link, metres.
+        outlook: of `measure_outlook` at the first node, in the level axes of the tour; zeros and None are unknown.
     """
     along, direction = _find_level_direction(tour, start, end), tour.find_direction(start, end)
     if along is None or direction is None:
@@ -57,7 +58,9 @@ def find_link_ring(
     down = tour.level_axes[:, 1]
     fall = float(direction @ down)
     distance = height * float(direction @ along) / fall if fall > 0 else _RING_METRES[1]
-    free = max(_BEFORE_WALL * wall, _NEAREST_WALL)
+    right, _, forward = tour.level_axes.T @ along
+    wall = 0.0 if outlook is None else float(outlook[find_bin(math.atan2(right, forward))])
+    free = max(_BEFORE_WALL * wall, _NEAREST_WALL) if wall else math.inf
     return float(np.clip(min(distance, free), *_RING_METRES)) * along + height * down
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from pansplat.inputs.pairs import Link
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.links import find_link_ring, find_way_along_link
+from pansplat.tours.outlook import BINS, find_bin
 
 
 def _link(tour: TourGraph, pitch: float) -> TourGraph:
@@ -26,8 +27,10 @@ def test_a_ring_is_where_the_link_meets_the_floor_one_to_three_metres_away(make_
 
 def test_a_ring_is_before_the_wall_that_the_link_leads_through_but_not_below_the_camera(make_tour) -> None:
     tour = _link(make_tour(((0, 0), (0, 1)), ((0, 0), (1, 1))), 0.05)
-    for wall, distance in ((2.0, 1.6), (0.8, 1.3), (0.1, 1.3), (9.0, 3.0)):
-        assert np.allclose(find_link_ring(tour, 0, 1, 1.5, wall), (distance, 1.5, 0))
+    for wall, distance in ((2.0, 1.6), (0.8, 1.3), (0.1, 1.3), (9.0, 3.0), (0.0, 3.0)):
+        outlook = np.zeros(BINS)
+        outlook[find_bin(0.5 * math.pi)] = wall
+        assert np.allclose(find_link_ring(tour, 0, 1, 1.5, outlook), (distance, 1.5, 0))
 
 
 def test_a_vertical_link_and_none_have_no_ring(make_tour) -> None:

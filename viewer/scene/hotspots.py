@@ -55,7 +55,7 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
     }
     for node, link in links.items():
         if (node in hidden or tour.is_fade(here, node)) and node not in feet:
-            ring = find_link_ring(tour, here, node, scenes.camera_height)
+            ring = find_link_ring(tour, here, node, scenes.camera_height, scenes.outlooks.get(here))
             if ring is not None:
                 feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
     found = []

@@ -39,6 +39,7 @@ class TourScenes:
         tour: the graph.
         edge: the edge that the camera is at.
         outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
+        outlooks: what is seen around panoramas whose scenes have been loaded (`measure_outlook`).
         hidden: the panoramas whose places on the floor surfaces hide, by those panoramas.
     """
 
@@ -55,7 +56,7 @@ class TourScenes:
         self.edge: Edge = next(iter(tour.overlaps))
         self._is_edge_known = False  # whether the camera has been at the edge
         self.outlines: dict[int, FloorOutline] = {}
-        self._outlooks: dict[int, np.ndarray] = {}
+        self.outlooks: dict[int, np.ndarray] = {}
         self.hidden: dict[int, list[int]] = {}
         self._views = tour.choose_scene_views()
         everything = tuple(range(len(tour)))
@@ -129,7 +130,7 @@ class TourScenes:
         views = loaded.entry.views
         if (facts := loaded.facts) is not None:
             self.outlines |= facts.outlines
-            self._outlooks |= zip(facts.views, facts.outlooks, strict=True)
+            self.outlooks |= zip(facts.views, facts.outlooks, strict=True)
             self.hidden |= zip(facts.views, facts.hidden, strict=True)
             self._block(facts.walls)
             clearances = dict(zip(facts.views, facts.clearances, strict=True))
@@ -293,7 +294,7 @@ class TourScenes:
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
         """A route from a pose to a panorama, which ends as `choose_arrival` states."""
-        outlook = self._outlooks.get(node, np.zeros(BINS))
+        outlook = self.outlooks.get(node, np.zeros(BINS))
         return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlook)
 
     def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pansplat.inputs.pairs import Link
+from pansplat.tours.outlook import BINS
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.hotspots import find_clicked, find_hotspots
 from pansplat_viewer.scene.tour import TourScenes
@@ -28,6 +29,9 @@ def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_ho
         (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
         assert hotspot.center == pytest.approx((100, 100 + focal / distance)), "1 to 3 m away"
         assert hotspot.label == "room2"
+    scenes.outlooks[3] = np.full(BINS, 2.0)
+    (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
+    assert hotspot.center == pytest.approx((100, 100 + focal / 1.6)), "before a wall"
 
 
 def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(house, load_house):
