@@ -44,7 +44,7 @@ def find_link_ring(
 ) -> Float[np.ndarray, "3"] | None:
     """From a camera to the ring of a link, in world axes; None without a link, or if it is vertical.
 
-    It is where the link meets the floor, 1 to 3 m away; before a wall, but for a near one not nearly below the camera.
+    It is where the link meets the floor, 1 to 3 m away. A wall brings it nearer, to 1.3 m at the least.
 
     Args:
         tour: the graph.
