@@ -573,14 +573,13 @@ def _describe_links(
         position, is_elsewhere = np.array(spots[start]["position"]), tour.parts[start] != tour.parts[end]
         way = find_way_along_link(tour, start, end)
         if way is not None:
-            yaw, _ = find_angles(tour.level_axes.T @ way / np.linalg.norm(way))
             ring = find_link_ring(tour, start, end, heights[start], outlooks[start])
             assert ring is not None
             if is_elsewhere or end in spots[start]["hidden"]:
                 found["mark"] = _round(position + ring)
             if is_elsewhere:
                 found["leave"] = _round(position + way)
-                found["yaw"] = round(yaw, 5)
+                found["yaw"] = round(find_angles(tour.level_axes.T @ way / np.linalg.norm(way))[0], 5)
         links.append(found)
     return links
 

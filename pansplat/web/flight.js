@@ -44,22 +44,27 @@ export function setPose(pose) {
 export function toggleDoll() {
   const { doll } = state;
   if (doll.isOn) visit(doll.node, doll.heading);
-  else if (doll.isDue) setDollDue(false);
+  else if (doll.isDue) setDoll(false);
   else enterDoll();
 }
 
 // Flies out of the panorama at the camera, once the Gaussians and the atlas are there.
 function enterDoll() {
   const { doll } = state;
-  if (state.headset.session) return;
+  if (state.headset.session) {
+    setDoll(false);
+    return;
+  }
   setTouring(false);
   doll.node = nearestNode(camera.position);
   if (!findHouse()) {
     say(byId("no-doll").textContent);
     return;
   }
-  setDollDue(!canShowDoll());
-  if (doll.isDue) return;
+  if (!canShowDoll()) {
+    setDoll(false, true);
+    return;
+  }
   takeStill();
   setDoll(true);
   camera.roll = 0;
@@ -68,11 +73,6 @@ function enterDoll() {
 }
 
 const canShowDoll = () => state.sorted !== null && byId("atlas")?.complete === true;
-
-function setDollDue(value) {
-  state.doll.isDue = value;
-  byId("doll").setAttribute("aria-pressed", value || state.doll.isOn);
-}
 
 // Flies into a panorama, and ends there; by default it looks where the camera looks from outside.
 function visit(node, heading = chooseArrival(node, { yaw: camera.yaw, pitch: 0 })) {
@@ -93,12 +93,12 @@ export function enterAt(left, top) {
   visit(nearestInDoll(plus(camera.position, scaled(rayOf(left, top), distance))));
 }
 
-// Without a flight.
-function setDoll(value) {
+// Without a flight. `isDue`: it opens when its data is there.
+function setDoll(isOn, isDue = false) {
   const { doll } = state;
-  if (doll.isOn && !value) camera.fov = doll.fov;
-  Object.assign(doll, { isOn: value, flight: null });
-  byId("doll").setAttribute("aria-pressed", value);
+  if (doll.isOn && !isOn) camera.fov = doll.fov;
+  Object.assign(doll, { isOn, isDue, flight: null });
+  byId("doll").setAttribute("aria-pressed", isOn || isDue);
   changed();
 }
 
@@ -243,7 +243,7 @@ export function advanceRoute(seconds) {
 }
 
 export function setTouring(value) {
-  setDollDue(false);  // another way replaces it
+  if (state.doll.isDue) setDoll(false);  // another way replaces it
   state.isTouring = value && HEADER.spots.length > 1;
   if (state.isTouring && state.doll.isOn) jumpTo(state.doll.node);
   byId("play").setAttribute("aria-pressed", state.isTouring);

@@ -96,6 +96,7 @@ HOLD = """
     };
     release = () => { isHolding = () => false; held.splice(0).forEach((message) => worker.postMessage(message)); };
 """
+WITHOUT_GAUSSIANS = HOLD + "isHolding = ({ chunk }) => chunk;"
 
 
 def new_context(chromium: Any, **options: Any) -> Any:
@@ -332,8 +333,9 @@ def room_page(room: Scene, room_photographs: list[Pair], tmp_path_factory: pytes
 
 
 def test_the_dolls_house_opens_when_the_gaussians_have_arrived(chromium: Any, room_page: Path) -> None:
-    holding = HOLD + "isHolding = ({ chunk }) => chunk;"
-    with opened(chromium, room_page, script=holding, is_stepped=True) as page:  # of which the photograph is shown
+    with opened(
+        chromium, room_page, script=WITHOUT_GAUSSIANS, is_stepped=True
+    ) as page:  # of which the photograph is shown
         page.page.emulate_media(reduced_motion="reduce")
         start = page.camera
         for is_due, press in ((True, "KeyO"), (False, "KeyO"), (True, "KeyO"), (False, "KeyR"), (True, "KeyO")):
@@ -874,8 +876,7 @@ def test_the_page_works_when_the_first_view_has_arrived(chromium: Any, folder: P
 def test_the_photograph_is_shown_before_any_gaussians_arrive(
     chromium: Any, folder: Path, photographs: list[Pair], name: str
 ) -> None:
-    holding = HOLD + "isHolding = ({ chunk }) => chunk;"
-    with opened(chromium, folder / name, script=holding, is_stepped=True) as page:  # and is ready
+    with opened(chromium, folder / name, script=WITHOUT_GAUSSIANS, is_stepped=True) as page:  # and is ready
         node, start, level = page.run("HEADER.loading[0]"), page.camera["position"], np.array(page.run("HEADER.level"))
         page.run("pansplat.setPose({ yaw: 30, pitch: 10 })")
         page.wait("document.getElementById('cover').hidden")
