@@ -1,5 +1,6 @@
 """Windows and macOS, as far as fakes show it: names, locks, signals, drives and consoles."""
 
+import ast
 import errno
 import json
 import os
@@ -115,3 +116,21 @@ def test_the_classic_console_of_windows_gets_no_escape_codes(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     console.print_message("error", "text")
     assert ("\x1b" in capsys.readouterr().err) == has_color
+
+
+# Sorting
+
+_WITHOUT_TIES = {"np.argsort(order)", "np.argsort(placed)", "torch.argsort(torch.cat(places))"}  # permutations
+
+
+def test_equal_numbers_are_in_one_order_on_every_processor() -> None:
+    """NumPy's quicksort orders equal numbers otherwise with AVX-512 than with AVX2 or without either."""
+    root, unstable = Path(__file__).resolve().parents[1], []
+    for path in [*root.glob("pansplat/**/*.py"), *root.glob("viewer/**/*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "argsort"):
+                continue
+            options = {word.arg: ast.unparse(word.value) for word in node.keywords}
+            if options.get("kind") != "'stable'" and options.get("stable") != "True":
+                unstable += [ast.unparse(node)] if ast.unparse(node) not in _WITHOUT_TIES else []
+    assert unstable == []

@@ -343,7 +343,8 @@ class Collection:
         if self.ordered or count == 2:
             return list(itertools.pairwise(members))
         centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
-        distance = (centres - centres[0]).norm(dim=-1)  # Prim's algorithm from the first panorama
+        # Prim's algorithm from the first panorama; distances of a grid are equal but for rounding
+        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)
         parent = torch.zeros(count, dtype=torch.long)
         outside = torch.ones(count, dtype=torch.bool)
         outside[0] = False
@@ -352,7 +353,7 @@ class Collection:
             new = int(torch.where(outside, distance, torch.inf).argmin())
             edges.append(tuple(sorted((members[int(parent[new])], members[new]))))
             outside[new] = False
-            distance_to_new = (centres - centres[new]).norm(dim=-1)
+            distance_to_new = (centres - centres[new]).norm(dim=-1).round(decimals=6)
             parent[distance_to_new < distance] = new
             distance = torch.minimum(distance, distance_to_new)
         return sorted(edges)

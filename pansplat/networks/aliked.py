@@ -171,7 +171,8 @@ def find_keypoints(
     inner = torch.zeros_like(allowed)
     inner[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] = allowed[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
     peaks = torch.where(_local_maxima(scores) & inner, scores, 0.0).flatten()
-    index = peaks.topk(min(count, int((peaks > 0).sum()))).indices
+    places = peaks.nonzero()[:, 0]
+    index = places[peaks[places].argsort(descending=True, stable=True)[:count]]  # equal ones by place
     steps = torch.arange(-_RADIUS, _RADIUS + 1, device=scores.device)
     square = torch.stack((steps.repeat(5), steps.repeat_interleave(5)), dim=-1)
     around = scores.flatten()[index[:, None] + square[:, 0] + width * square[:, 1]]

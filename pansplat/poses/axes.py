@@ -114,7 +114,7 @@ def _segment_normals(image: UInt8[Array, "height width"]) -> tuple[Float[Array, 
 def _search_axes(normals: Float[Array, "n 3"], lengths: Float[Array, "n"]) -> Float[Array, "3 3"]:
     """Start of the fit: the direction near the camera's y axis with most edges, then the best yaw."""
     first, second = np.triu_indices(min(len(normals), 120), 1)
-    order = np.argsort(-lengths)
+    order = np.argsort(-lengths, kind="stable")
     crossing = np.cross(normals[order[first]], normals[order[second]])
     norm = np.linalg.norm(crossing, axis=1)
     crossing = crossing[norm > 0.2] / norm[norm > 0.2][:, None]

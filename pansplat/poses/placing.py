@@ -257,7 +257,7 @@ class Piece:
             own = (np.abs(np.angle(np.exp(1j * (normals - normal)))) < _WALL_TURN) & (np.abs(turns) < 3 * _DOOR)
             if cosine > _GRAZING and own.any():
                 offsets = places[own] @ (math.sin(normal), math.cos(normal))
-                order = offsets.argsort()
+                order = offsets.argsort(kind="stable")
                 sums = weights[own][order].cumsum()
                 reach = offsets[order][np.searchsorted(sums, 0.5 * sums[-1])] / cosine
                 if reach * cosine > _LEAST_WALL:

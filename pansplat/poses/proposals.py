@@ -86,7 +86,7 @@ def _choose_alike(
     poses = levels[1].T @ rotations @ levels[0], translations @ levels[1]
     odds = _ALIKE[0] * np.log1p(votes) + _compare_alike(surroundings, *poses, coarse=True) + links.score(*poses)
     chosen: list[int] = []
-    for n in np.argsort(-odds).tolist():
+    for n in np.argsort(-odds, kind="stable").tolist():
         if len(chosen) == _KEPT_ALIKE:
             break
         if all(
@@ -145,7 +145,7 @@ def _find_modes(
 ) -> list[tuple[Float[Array, "3"], float]]:
     """Translations with most votes, and these."""
     found: list[tuple[Array, float]] = []
-    for n in np.argsort(-votes):
+    for n in np.argsort(-votes, kind="stable"):
         if len(found) == _MODES:
             break
         if all(np.linalg.norm(translations[n] - t) > 2 * reach[n] for t, _ in found):
@@ -179,7 +179,7 @@ def _vote_pairs(
     squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
     votes = np.exp(-0.5 * squared).sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2)
     found: list[int] = []
-    for n in np.argsort(-votes):
+    for n in np.argsort(-votes, kind="stable"):
         if len(found) == _MODES:
             break
         if all(squared[n, other] > 4 for other in found):

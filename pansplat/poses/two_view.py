@@ -386,7 +386,7 @@ def _sample_essentials(
 def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int) -> Float[Array, "kept 3 3"]:
     """At most `count` different essential matrices with the highest scores, best first."""
     quick = _score_essentials(essential, evidence.strongest(_QUICK))
-    essential = essential[np.argsort(-quick)[:_RESCORED]]
+    essential = essential[np.argsort(-quick, kind="stable")[:_RESCORED]]
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
 
 
@@ -486,7 +486,7 @@ def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], 
     """Indices of the best hypotheses whose essential matrices differ."""
     picked: list[int] = []
     norm = np.linalg.norm(essential, axis=(1, 2))
-    for index in np.argsort(-scores)[:_COMPARED_ESSENTIALS]:
+    for index in np.argsort(-scores, kind="stable")[:_COMPARED_ESSENTIALS]:
         if len(picked) == kept:
             break
         similarity = [abs((essential[index] * essential[p]).sum()) / (norm[index] * norm[p]) for p in picked]

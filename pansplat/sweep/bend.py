@@ -123,7 +123,7 @@ def fit_field(
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    order = values.ravel().argsort()
+    order = values.ravel().argsort(kind="stable")
     total = weights.ravel()[order].cumsum()
     return float(values.ravel()[order[np.searchsorted(total, 0.5 * total[-1])]])
 

@@ -209,7 +209,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> l
 
 def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list[int]]:
     """The other views of each view, the nearest cameras first, at most `count`; those within `least` metres last."""
-    distances = measure_distances(cam2world)
+    distances = measure_distances(cam2world).round(6)  # of a grid they are equal but for rounding
     distances[distances < least] += distances.max()
     np.fill_diagonal(distances, -1)
     return distances.argsort(axis=1, kind="stable")[:, 1 : count + 1].tolist()

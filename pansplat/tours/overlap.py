@@ -36,7 +36,7 @@ def connect(tour: TourGraph) -> TourGraph:
     edges are walls if their panoramas show nothing in common.
     """
     world = np.array([panorama.world for panorama in tour.panoramas])
-    distances = np.linalg.norm(tour.positions[:, None] - tour.positions[None], axis=2)
+    distances = np.linalg.norm(tour.positions[:, None] - tour.positions[None], axis=2).round(6)  # equal in a grid
     distances[world[:, None] != world] = np.inf
     compared = {(a, b) for a, b in tour.overlaps if a != b}
     for node in range(len(tour)):

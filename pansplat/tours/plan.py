@@ -303,7 +303,7 @@ def _find_lines(sights: Sequence[_Sight], normals: Float[np.ndarray, "direction 
         for _ in range(_MOST_LINES):
             if not len(offsets):
                 break
-            order = np.argsort(offsets)
+            order = np.argsort(offsets, kind="stable")
             offsets, weights = offsets[order], weights[order]
             sums = np.concatenate(([0.0], np.cumsum(weights)))
             first, last = (np.searchsorted(offsets, offsets + sign * _CLUSTER * unit) for sign in (-1, 1))

@@ -83,7 +83,7 @@ def test_the_blur_is_the_colour_around_it_across_the_seam() -> None:
     hidden[20:40, :20] = hidden[20:40, 110:] = True
     assert np.abs(blur_hidden(color, hidden)[hidden].astype(int) - (10, 120, 230)).max() <= 1
     rolled = blur_hidden(np.roll(color, 64, axis=1), np.roll(hidden, 64, axis=1))
-    assert np.array_equal(np.roll(rolled, 64, axis=1), blur_hidden(color, hidden))
+    assert np.abs(np.roll(rolled, 64, axis=1) - blur_hidden(color, hidden).astype(int)).max() <= 1, "but for rounding"
 
 
 @pytest.mark.parametrize("height", [16, 64, 100])

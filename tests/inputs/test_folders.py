@@ -148,6 +148,15 @@ def test_without_pairs_file_panoramas_are_paired_along_the_spanning_tree(tmp_pat
     assert [pair.name for pair in pairs] == ["0-2", "1-2", "1-3"]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_pairs_of_a_grid_do_not_depend_on_the_rounding_of_its_poses(tmp_path: Path, seed: int) -> None:
+    noise = np.random.default_rng(seed).normal(0, 1e-12, (9, 2))
+    names = [f"{i}.png" for i in range(9)]
+    poses = {name: _pose(*(divmod(i, 3) + noise[i])) for i, name in enumerate(names)}
+    pairs = load_pairs(_folder(tmp_path / "grid", names, poses=poses))
+    assert [pair.name for pair in pairs] == ["0-1", "0-3", "1-2", "1-4", "2-5", "3-6", "4-7", "5-8"]
+
+
 def test_triplets_come_first_and_contexts_are_unique(tmp_path: Path) -> None:
     names = ("a.png", "b.png", "c.png")
     folder = _folder(tmp_path / "flat", names)

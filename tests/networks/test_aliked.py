@@ -37,3 +37,11 @@ def test_keypoints_are_the_allowed_peaks_below_a_pixel() -> None:
     points = find_keypoints(scores, allowed, 2)
     torch.testing.assert_close(points, torch.tensor(((10.0, 8.0), (30.25, 20.0))), rtol=0, atol=0.15)
     assert len(find_keypoints(torch.zeros(30, 40), allowed, 5)) == 0
+
+
+def test_equal_peaks_are_taken_in_the_order_of_their_places() -> None:
+    scores = torch.zeros(100, 100)
+    scores[5:95:6, 5:95:6] = 0.5
+    points = find_keypoints(scores, torch.ones(100, 100, dtype=torch.bool), 40)
+    grid = torch.cartesian_prod(torch.arange(5.0, 95, 6), torch.arange(5.0, 95, 6)).flip(1)
+    torch.testing.assert_close(points, grid[:40])

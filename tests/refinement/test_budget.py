@@ -66,7 +66,7 @@ def test_merging_equal_neighbours_changes_the_image_less_than_dropping_them(room
     scene = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, harmonics=smooth))
     contributions = measure_contributions(scene, SIZE)
     merged = merge_to(scene, SIZE, 800).gaussians
-    best = contributions.argsort(descending=True)[:800]
+    best = contributions.argsort(descending=True, stable=True)[:800]
     pose = scene.pose_between(0.5)
 
     def image(gaussians: Gaussians) -> torch.Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pansplat.sweep import search as module
-from pansplat.sweep.search import SearchConfig, observe, search
+from pansplat.sweep.search import SearchConfig, choose_nearest, observe, search
 from pansplat.sweep.surface import PosedImages
 
 
@@ -98,3 +98,10 @@ def test_more_views_are_no_worse_than_two(small_furnished_room, three_views):
 def test_coincident_cameras_give_the_middle_of_the_range(small_room):
     inverse = _search(small_room.posed, cam2world=np.stack([small_room.posed.cam2world[0]] * 2))
     assert np.allclose(inverse, 0.5 * (1 / 0.5 + 1 / 8.0))
+
+
+def test_the_nearest_views_of_a_grid_do_not_depend_on_the_rounding_of_its_poses():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :3:2, 3] = [divmod(i, 3) for i in range(9)]
+    noise = np.random.default_rng(0).normal(0, 1e-12, poses.shape)
+    assert choose_nearest(poses + noise, 2, 0.1) == choose_nearest(poses, 2, 0.1)
