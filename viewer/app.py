@@ -67,7 +67,7 @@ class Options:
     device: Device = "auto"
     """As that of `pansplat predict`; OpenGL draws on its own card (--renderer)."""
     verbose: bool = False
-    """Print what runs where."""
+    """Print what runs where, and the figures of reasons."""
     size: str | None = None
     """Width x height, pixels (window 1280x720, film 1920x1080)."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None

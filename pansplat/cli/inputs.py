@@ -45,7 +45,7 @@ class Computation(Writer):
     """auto: the graphics card for long work if there is one that torch can use, else the processor; cpu, cuda: for all
     work (docs/platforms.md)."""
     verbose: bool = field(default=False, kw_only=True)
-    """Print what runs where."""
+    """Print what runs where, and the figures of reasons."""
 
 
 @dataclass(frozen=True)

@@ -47,14 +47,14 @@ class Pose(Computation):
         folder = self.path if self.path.is_dir() else self.path.parent
         with progress_bar():
             estimate = estimate_panoramas(folder, panoramas, camera_height=self.camera_height, baseline=self.baseline)
-        _print_estimate(estimate)
+        _print_estimate(estimate, figures=self.verbose)
         if self.out is not None:
             write_poses(estimate, self.out, overwrite=self.overwrite)
             print(self.out)
         return 0
 
 
-def _print_estimate(estimate: PoseEstimate) -> None:
+def _print_estimate(estimate: PoseEstimate, *, figures: bool) -> None:
     """The table of the pairs that place the panoramas, the summary, and the panoramas without a pose."""
     import math
 
@@ -65,6 +65,7 @@ def _print_estimate(estimate: PoseEstimate) -> None:
         table.add_column(column, justify="left" if column in ("pair", "check") else "right")
     for (i, j), relation in estimate.relations.items():
         if relation.is_reliable or len(estimate.relations) <= 3:
+            problem = relation.problem or ("certain" if relation.is_certain else "probable")
             degrees = [math.degrees(angle) for angle in (relation.parallax, *relation.uncertainty)]
             table.add_row(
                 " - ".join(estimate.name_of(estimate.images[n]) for n in (i, j)),
@@ -72,7 +73,7 @@ def _print_estimate(estimate: PoseEstimate) -> None:
                 "matches suffice" if math.isinf(relation.log_odds) else f"{math.exp(relation.log_odds):.1f}",
                 f"{degrees[0]:.1f}",
                 *(f"{value:.2f}" for value in degrees[1:]),
-                relation.problem or ("certain" if relation.is_certain else "probable"),
+                problem if figures else problem.partition(":")[0],
             )
     make_table_console().print(table)
     print(estimate.summary)

@@ -51,7 +51,7 @@ from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, 
 from pansplat.sweep.guided_sweep import list_default_weights
 from pansplat.system.console import with_progress_bar
 from pansplat.system.descriptions import describe_count, describe_range, list_first
-from pansplat.system.devices import choose_device
+from pansplat.system.devices import choose_device, say_detail
 from pansplat.system.files import require_file, require_text
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
@@ -314,8 +314,10 @@ def estimate_poses(
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
     tour = build_tour([v.joined for v in views], relations, downs, noise)
     placed, listed = [position for group in tour.groups for position in group.placed], [names[paths[n]] for n in kept]
-    for position, (reason, other) in tour.unplaced.items():
-        partner = "" if other is None else f" (its best pair is with {listed[other]})"
+    for position, (reason, other, figures) in tour.unplaced.items():
+        partner = "" if other is None else f" (it has most in common with {listed[other]})"
+        if figures:
+            say_detail(f"{listed[position]} and {listed[other]}", figures)
         unplaced[kept[position]] = _describe_mirrored(position, views, placed, listed) or reason + partner
     files = [paths[n] for n in kept]
     suggestions = _suggest(views, relations, files)

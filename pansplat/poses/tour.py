@@ -38,6 +38,12 @@ _AGREEING_PLACES = 0.2  # distance of two places of a panorama that confirm each
 _OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
 _FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
 _ROUNDS = 3  # of adjustment and removal of outliers
+_NONE_SHOWS_IT = "no other photograph shows this room{}: take one in the doorway"
+_REASONS = {  # by the problem of the best pair, without its figures
+    "": "it seems to be at another place than other photographs state: take one more near it",
+    "both were taken at one place": "another photograph was taken at this place: take one a metre away",
+    "one of both looks mirrored left to right": "it or another photograph looks mirrored left to right: flip it",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +71,14 @@ class Tour:
         groups: the largest one first.
         confirmed: doubtful pairs that agree with the others of their group.
         rejected: pairs that contradict the others.
-        unplaced: for each panorama without a pose the reason, and the other panorama of its best pair.
+        unplaced: for each panorama without a pose why, and what its owner can do, the other panorama of its best pair,
+            and the figures of that pair.
     """
 
     groups: tuple[Group, ...]
     confirmed: dict[IndexPair, RelativePose]
     rejected: tuple[IndexPair, ...]
-    unplaced: dict[int, tuple[str, int | None]]
+    unplaced: dict[int, tuple[str, int | None, str]]
 
 
 def build_tour(
@@ -260,13 +267,15 @@ def _place_group(
     return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(bundle), residual_angles(bundle))
 
 
-def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None]:
-    """Why a panorama has no pose: the problem of its best pair."""
+def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None, str]:
+    """`Tour.unplaced` of a panorama."""
     own = [(pair, relation) for pair, relation in relations.items() if view in pair]
     if not own:
-        return "it has nothing in common with another panorama", None
+        return _NONE_SHOWS_IT.format(""), None, ""
     pair, best = max(own, key=lambda item: (item[1].log_odds, item[1].places))
-    return best.problem or "its pose contradicts those of others", pair[0] if pair[1] == view else pair[1]
+    figures = best.problem or ""
+    reason = _REASONS.get(figures.partition(":")[0], _NONE_SHOWS_IT.format(" well enough"))
+    return reason, pair[0] if pair[1] == view else pair[1], figures
 
 
 def _find_contradictions(relations: Mapping[IndexPair, RelativePose]) -> tuple[IndexPair, ...]:

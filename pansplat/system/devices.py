@@ -80,15 +80,15 @@ def choose_device(work: str, seconds: float = math.inf, *, kernels: bool = False
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # convolutions round as those of a processor do
     reason = ", which is faster for short work" if card is not None and is_short else ""
-    say_place(work, f"on {'the processor' if device.type == 'cpu' else card}{reason}")
+    say_detail(work, f"on {'the processor' if device.type == 'cpu' else card}{reason}")
     return device
 
 
-def say_place(work: str, place: str) -> None:
-    """Say where some work runs, for `--verbose`."""
+def say_detail(subject: str, text: str) -> None:
+    """Say where some work runs, or the figures of a reason, for `--verbose`."""
     _, say = _current.get()
     if say is not None:
-        say(f"{work}: {place}")
+        say(f"{subject}: {text}")
 
 
 def note_full_card(work: str, then: str = "it runs on the processor") -> None:

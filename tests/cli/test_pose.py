@@ -14,6 +14,7 @@ from pansplat.cli import run
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
+from pansplat.poses.two_view import RelativePose
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import is_progress_shown
 from pansplat_viewer.scene.loader import find_entries
@@ -180,6 +181,16 @@ def test_messages_name_rooms_by_their_titles(linked: Path, estimator, capsys) ->
     third = {"links.json": "c.png", "tour.json": "c.png", "data.js": "Room c"}
     name = next(name for file, name in third.items() if (linked / file).exists())
     assert f"{name} has no pose: no door" in error and "cube" not in error
+
+
+def test_figures_of_reasons_are_for_verbose(folder: Path, estimator, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    relation = RelativePose(np.eye(3), np.eye(3)[2], np.empty((0, 2), int), problem="too little in common: 20 places")
+    estimator(lambda images, **options: replace(_place_two(images), relations={(0, 1): relation}))
+    for options in ([], ["--verbose"]):
+        assert run(["pose", str(folder), *options]) == 0
+        printed = capsys.readouterr().out
+        assert "too little in common" in printed and ("20 places" in printed) == bool(options)
 
 
 def test_poses_of_cube_faces_beside_each_other_are_refused_before_the_estimate(

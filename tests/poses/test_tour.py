@@ -108,12 +108,15 @@ def test_an_unreliable_pair_does_not_connect_groups() -> None:
     assert [group.placed for group in tour.groups] == [(0, 1), (2, 3)]
 
 
-def test_the_reason_against_a_panorama_is_that_of_its_most_probable_pair() -> None:
-    tour = build((0, 1), (1, 2), views=4, problem="too little in common", log_odds=0.2)
+def test_the_reason_against_a_panorama_says_what_to_do_and_has_the_figures_apart() -> None:
+    tour = build((0, 1), (1, 2), views=4, problem="too little in common: 20 places match", log_odds=0.2)
+    room = "no other photograph shows this room"
     assert tour.unplaced == {
-        2: ("too little in common", 1),
-        3: ("it has nothing in common with another panorama", None),
+        2: (f"{room} well enough: take one in the doorway", 1, "too little in common: 20 places match"),
+        3: (f"{room}: take one in the doorway", None, ""),
     }
+    tour = build((0, 1), (1, 2), views=3, problem="both were taken at one place: parallax of 0.02 degrees")
+    assert tour.unplaced[2][0] == "another photograph was taken at this place: take one a metre away"
 
 
 @pytest.mark.parametrize("changes", [{"turn": math.radians(20)}, {"stretch": 2.0}])

@@ -37,7 +37,7 @@ from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMIT
 from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.system.devices import say_place
+from pansplat.system.devices import say_detail
 from pansplat_viewer.draw.color_maps import map_values
 from pansplat_viewer.draw.displays import color_by_property
 from pansplat_viewer.draw.frame_renderer import Pacing
@@ -443,13 +443,13 @@ def create_renderer(
 ) -> SplatRenderer | CpuRenderer:
     """Create the renderer of this choice; `color_bits` is for `gl`."""
     if choose_renderer(ctx, choice) == "cpu":
-        say_place("drawing", "on the processor")
+        say_detail("drawing", "on the processor")
         return CpuRenderer(ctx)
     if ctx is None:
         raise InputError("renderer `gl` needs an OpenGL context; use `cpu`")
     from pansplat_viewer.draw.renderer import SplatRenderer
 
-    say_place("drawing", f"by OpenGL, {ctx.info['GL_RENDERER']}")
+    say_detail("drawing", f"by OpenGL, {ctx.info['GL_RENDERER']}")
     return SplatRenderer(ctx, color_bits=color_bits)
 
 
