@@ -1,4 +1,4 @@
-# pansplat on the processor, drawing by Mesa without a display (README.md, "In a container").
+# pansplat on the processor, drawing by Mesa without a display (docs/platforms.md, "Containers").
 FROM debian:bookworm-slim
 
 # Python, and GL_PACKAGES of setup.sh

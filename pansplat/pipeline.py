@@ -65,7 +65,6 @@ from pansplat.tours.overlap import connect
 __all__ = [
     "estimate_poses",
     "fuse",
-    "fuse_tour",
     "load",
     "load_model",
     "load_pairs",

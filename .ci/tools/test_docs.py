@@ -35,6 +35,9 @@ def test_calls_of_the_readme_exist() -> None:
     calls = set(re.findall(r"pansplat\.(\w+)\(", README))
     assert calls >= {"predict", "render", "load_model", "rasterize", "save", "load"} and calls <= set(pansplat.__all__)
     assert all(callable(getattr(pansplat, name)) for name in pansplat.__all__)
+    assert set(pansplat.pipeline.__all__) <= set(pansplat.__all__)
+    pictures = re.findall(r"^(?:image|picture) = pansplat\.(\w+)\(.*\)\.color", README, re.MULTILINE)
+    assert pictures == ["render", "rasterize"], "a tensor, not a `Rendering`"
 
 
 def test_links_of_the_readme_exist_and_lead_to_every_document() -> None:
@@ -42,6 +45,27 @@ def test_links_of_the_readme_exist_and_lead_to_every_document() -> None:
     local = {target for target in targets if not target.startswith("http")}
     assert not [target for target in local if not (ROOT / target).exists()]
     assert {f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md")} <= local
+
+
+def test_tables_have_no_gaps_and_named_sections_exist() -> None:
+    documents = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]
+    texts = {
+        file: re.sub(r"^```.*?^```", "", file.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE) for file in documents
+    }
+    headings = {file: re.findall(r"^#+ (.+)$", text, re.MULTILINE) for file, text in texts.items()}
+    wrong = [
+        f"{file.name}: {row}"
+        for file, text in texts.items()
+        for row in re.findall(r"^[^|\n].*\n(\|.*)", text, re.MULTILINE)
+    ]
+    cited = re.findall(r'\((\S+\.md), "(.+?)"\)', (ROOT / "Dockerfile").read_text("utf-8"))
+    wrong += [f"{name}: {title}" for name, title in cited if title not in headings.get(ROOT / name, ())]
+    for file, text in texts.items():
+        for name, anchor in re.findall(r"\]\((?!http)([^)#]*)#([^)]+)\)", text):
+            titles = headings[(file.parent / name).resolve() if name else file]
+            if anchor not in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}:
+                wrong.append(f"{file.name}: {name}#{anchor}")
+    assert cited and not wrong
 
 
 def test_pose_files_of_the_readme_are_read(tmp_path: Path) -> None:

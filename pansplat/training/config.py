@@ -260,7 +260,7 @@ def _small_preset(
 
 _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
-        "no files, about 4 minutes on two cores: a very small network, rooms of boxes, 64x128",
+        "no files, about 4 minutes on two idle cores: a very small network, rooms of boxes, 64x128",
         _small_preset("tiny", (64,), 300, 2, 2e-3, 100, DataConfig(workers=0)),  # workers would start for seconds
     ),
     "small": (
