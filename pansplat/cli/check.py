@@ -41,8 +41,11 @@ class Check:
         if check.likely_mistake:
             console.print(f"likely mistake: {check.likely_mistake}", style="bold red", markup=False, soft_wrap=True)
             return 1
-        if check.can_judge:
-            print("no other interpretation of the poses fits far better")
-        else:
+        if not check.can_judge:
             print("undecided: the check says nothing for or against these poses")
+        elif check.similar:
+            listed = ", ".join(f"{reading} ({check.errors[reading]:.3f})" for reading in check.similar)
+            print(f"undecided between {AS_GIVEN} ({check.error:.3f}) and what fits about as well: {listed}")
+        else:
+            print("no other interpretation of the poses fits as well")
         return 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pansplat.cli import run
+from pansplat.evaluation.pose_check import PoseCheck
 
 
 def test_info_prints_counts_and_cameras(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,6 +36,15 @@ def test_check_exits_with_1_if_the_convention_is_wrong(shared: Path, capsys: pyt
     assert "as given" in capsys.readouterr().out
     assert run(["check", pair, "--convention", "cam2world opencv"]) == 1
     assert "likely mistake" in capsys.readouterr().out
+
+
+def test_check_is_undecided_between_what_fits_about_as_well(pair_folder: Path, monkeypatch, capsys) -> None:
+    errors = {"as given": 0.445, "mirrored up-down": 0.450}
+    found = PoseCheck("a", 2.0, 0.445, errors, (), ("mirrored up-down",), None, True, ())
+    monkeypatch.setattr("pansplat.evaluation.pose_check.check_pair", lambda pair: found)
+    assert run(["check", str(pair_folder)]) == 0
+    printed = "undecided between as given (0.445) and what fits about as well: mirrored up-down (0.450)"
+    assert printed in capsys.readouterr().out
 
 
 @pytest.mark.slow

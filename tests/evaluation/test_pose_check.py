@@ -13,6 +13,7 @@ from pansplat.evaluation.pose_check import (
     PoseCheck,
     _can_judge,
     _describe_mistake,
+    _list_similar,
     check_pair,
     check_views,
 )
@@ -85,7 +86,7 @@ def _best(check: PoseCheck) -> str:
 def test_right_poses_fit_best() -> None:
     check = check_views(_views(*_TILTED), "box")
     assert _best(check) == AS_GIVEN
-    assert check.likely_mistake is None and check.can_judge and not check.warnings
+    assert check.likely_mistake is None and check.can_judge and not check.warnings and not check.similar
     assert check.error < 0.8 * sorted(check.errors.values())[1]
     assert check.baseline == pytest.approx(float((_TILTED[0] - _TILTED[1])[:3, 3].norm()))
 
@@ -123,6 +124,11 @@ def test_interpretations_with_the_same_relative_pose_are_indistinguishable_and_n
     assert {"opengl axes", "mirrored up-down", "transposed rotation"} <= set(check.indistinguishable)
     mistake = check_views(dataclasses.replace(views, cam2world=invert_pose(views.cam2world))).likely_mistake
     assert mistake is not None and _ADVICE["inverse"] in mistake and _ADVICE["swapped views"] in mistake
+
+
+def test_interpretations_that_fit_about_as_well_are_named() -> None:
+    errors = {"inverse": 0.443, AS_GIVEN: 0.445, "mirrored up-down": 0.450, "swapped views": 0.470}
+    assert _list_similar(errors) == ("inverse", "mirrored up-down")
 
 
 def test_three_views_are_checked_together() -> None:
