@@ -154,21 +154,20 @@ def make_room_scene(height: int) -> BenchScene:
     return BenchScene(f"room {height}", partial(full_lattice_room, _multiple_of_8(height)), pose)
 
 
-def choice_height(height: int, *, quick: bool) -> int:
-    """Height of the images that compare every choice; smaller in a quick run."""
-    return min(_multiple_of_8(0.375 * height) if quick else height, _MAX_CHOICE_HEIGHT)
+def choice_height(height: int) -> int:
+    """Height of the images that compare every choice."""
+    return min(_multiple_of_8(0.375 * height), _MAX_CHOICE_HEIGHT)
 
 
-def list_raster_groups(height: int, backends: Sequence[str], threads: int, *, quick: bool) -> list[Group]:
+def list_raster_groups(height: int, backends: Sequence[str], threads: int) -> list[Group]:
     """The main choices on the room of this height, and also pinhole images on the one of `choice_height`.
 
     Args:
         height: of the largest images, pixels.
         backends: available ones besides torch.
         threads: the largest number to use.
-        quick: whether `choice_height` is smaller.
     """
-    small = choice_height(height, quick=quick)
+    small = choice_height(height)
     headline = [case for name in backends for case in list_choices(name, height, threads)]
     headline += [RasterCase(name, height) for name in backends if threads > 1]
     headline += [RasterCase("torch", height)] if lattice_room_size(height) <= _MAX_TORCH_GAUSSIANS else []
@@ -202,7 +201,7 @@ def _multiple_of_8(height: float) -> int:
     return max(8, 8 * round(height / 8))
 
 
-def measure_raster(groups: Iterable[Group], *, budget: float = 2.0, slow: float = 5.0) -> Iterator[Row]:
+def measure_raster(groups: Iterable[Group], *, budget: float = 2.0, slow: float = 3.0) -> Iterator[Row]:
     """Yield the row of each case, and yield it again after each repeat.
 
     Args:

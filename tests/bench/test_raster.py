@@ -46,14 +46,26 @@ def test_the_quick_run_writes_rows_and_a_plot_and_prints_the_tables(tmp_path, ca
     monkeypatch.setattr(raster, "_MAX_REPEATS", 1)
     monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
     out = tmp_path / "out"
-    assert run(["bench", "raster", "--quick", "--height", "16", "--out", str(out), "--threads", "1"]) == 0
+    threads = torch.get_num_threads()
+    command = ["bench", "raster", "--quick", "--height", "16", "--out", str(out), "--threads", str(threads)]
+    assert run(command) == 0
     content = json.loads((out / "raster.json").read_text())
     assert {row["suite"] for row in content["rows"]} == {"headline", "choices"}
     assert {row["scene"] for row in content["rows"]} == {"room 16", "room 8"}
     for row in content["rows"]:
         assert row["forward_min_ms"] <= row["forward_ms"] and row["max_error"] is not None
         assert row["is_reference"] or {"backward_ms", "forward_cpu_ms", "backward_cpu_ms", "peak_mb"} <= row.keys()
-    assert content["machine"]["threads"] == 1
+    assert content["machine"]["threads"] == threads
     assert sorted(file.name for file in out.iterdir()) == ["raster.json", "raster.md", "raster.png"]
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("headline", "choices", "PSNR dB"))
+
+
+def test_the_quick_run_is_small(monkeypatch):
+    found = {}
+    monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
+    monkeypatch.setattr(raster, "measure_raster", lambda groups, budget: found.setdefault(budget, groups) and ())
+    for options in (["--quick"], []):
+        assert run(["bench", "raster", *options]) == 0
+    heights = [[max(case.height for case in group.cases) for group in groups] for groups in found.values()]
+    assert heights == [[128, 48], [512, 192]] and list(found) == sorted(found)
