@@ -59,9 +59,9 @@ def parse(argv: Sequence[str] | None = None) -> Command:
         raise InputError(f"needed a command, got {first!r}{near}; the commands are {', '.join(_COMMANDS)}")
     kind: Any = _list_commands()
     return parse_arguments(
-        lambda: tyro.cli(
+        lambda args: tyro.cli(
             kind,
-            args=argv,
+            args=args,
             prog="pansplat",
             description="Predict a scene of 3D Gaussians from 360-degree panoramas, render and export it. "
             "Also: pansplat --version.",

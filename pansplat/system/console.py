@@ -14,6 +14,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import textwrap
 import threading
 import time
 import traceback
@@ -37,9 +38,10 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
 _COLORS = {"error": 31, "interrupted": 31, "note": 33, "progress": 36}  # ANSI codes of red, yellow and cyan
-_COMPLETION = "--tyro-print-completion"
+_COMPLETION, _ALL = "--tyro-print-completion", "--help-all"
 _LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; whole time that is stated
 _AGREE = 1.5  # between two estimates of the whole time of some work
+_LONG_HELP = 60  # lines
 _MIN_WIDTH = 40  # columns of help; tyro's layout of narrow ones does not end
 _REDRAW_INTERVAL = 0.25  # seconds between two states of a progress bar in a notebook
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -219,11 +221,14 @@ def own_warnings() -> Iterator[None]:
         yield
 
 
-def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[str] | None) -> _T:
+def parse_arguments(parse: Callable[[Sequence[str]], _T], program: str, arguments: Sequence[str] | None) -> _T:
     """The result of a parser of arguments, which prints help or an error and raises SystemExit.
 
+    Help that is long describes the options of the command itself, and lists those of its groups; `--help-all` describes
+    all.
+
     Args:
-        parse: tyro's parser.
+        parse: tyro's parser of some arguments.
         program: name of the command.
         arguments: None for those of the process. `--version` prints the version and exits;
             `--tyro-print-completion SHELL` prints a script for the completion of arguments.
@@ -236,17 +241,39 @@ def parse_arguments(parse: Callable[[], _T], program: str, arguments: Sequence[s
         raise SystemExit(0)
     from pansplat.system.options import NUMBERS
 
-    script, width = io.StringIO(), os.environ.get("COLUMNS")
+    # tyro draws boxes as the encoding allows
+    printed = io.TextIOWrapper(io.BytesIO(), encoding=getattr(sys.stdout, "encoding", None) or "utf-8")
+    width = os.environ.get("COLUMNS")
+    is_script, is_short = given[:1] == [_COMPLETION], not {"-h", "--help"}.isdisjoint(given)
     if shutil.get_terminal_size().columns < _MIN_WIDTH:
         os.environ["COLUMNS"] = str(_MIN_WIDTH)
     try:
-        with NUMBERS, contextlib.redirect_stdout(script if given[:1] == [_COMPLETION] else sys.stdout):
-            return parse()
+        with NUMBERS, contextlib.redirect_stdout(printed if is_script or is_short else sys.stdout):
+            return parse(["--help" if argument == _ALL else argument for argument in given])
     finally:
+        columns = shutil.get_terminal_size().columns
         os.environ.pop("COLUMNS", None)
         os.environ |= {} if width is None else {"COLUMNS": width}
         # The shell would read the second line of a description as another word.
-        print(re.sub(r"\\n(?=.*'type':)", " ", script.getvalue()), end="")
+        printed.seek(0)
+        text = re.sub(r"\\n(?=.*'type':)", " ", printed.read())
+        print(_shorten_help(text, columns) if is_short else text, end="")
+
+
+def _shorten_help(text: str, columns: int) -> str:
+    """Long help with the required options first, and of each further group the names of its options."""
+    if text.count("\n") <= _LONG_HELP:
+        return text
+    shown, names = "", ""
+    for block in re.split(r"(?m)^(?=(?:╭─)? (?:[\w.-]+ )?(?:options|arguments)\b)", text):
+        first, *entries = re.split(r"(?m)^(?=(?:│ |  )--?\w)", block)
+        group = re.match(r"(?:╭─)? ([\w.-]+) options\b", block)
+        if group is None:
+            shown += first + "".join(sorted(entries[:-1], key=lambda entry: "(required)" not in entry) + entries[-1:])
+        else:
+            line = " ".join((f"{group[1]}:", *re.findall(r"(?m)^(?:│ |  )(--?\w[\w-]*)", block)))
+            names += textwrap.fill(line, columns, subsequent_indent="    ", break_on_hyphens=False) + "\n"
+    return f"{shown}More options; {_ALL} describes them:\n{names}" if names else shown
 
 
 def is_notebook() -> bool:

@@ -36,14 +36,14 @@ def _train(config: TrainConfig) -> int:
 def parse(argv: Sequence[str] | None = None) -> TrainConfig:
     """The settings of a command line. Prints help or errors and exits like argparse."""
 
-    def read() -> TrainConfig:
+    def read(arguments: Sequence[str]) -> TrainConfig:
         import tyro
 
         from pansplat.training.config import PRESETS
 
         return tyro.extras.overridable_config_cli(
             PRESETS,
-            args=argv,
+            args=arguments,
             prog="pansplat-train",
             description="Train a network. Run the same command again to resume a stopped run.",
             config=(tyro.conf.FlagCreatePairsOff,),

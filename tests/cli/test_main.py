@@ -1,7 +1,9 @@
 """What all commands share: help, version, completion, refused arguments, notes, interruptions and exit statuses."""
 
+import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -78,10 +80,28 @@ def test_the_completion_script_completes_in_bash(words: str, expected: set[str],
 def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2")
     with pytest.raises(SystemExit):
-        run([command, "--help"])
+        run([command, "--help-all"])
     headings = [line for line in capsys.readouterr().out.splitlines() if line.rstrip().endswith(" options")]
     assert os.environ["COLUMNS"] == "2" and len(headings) > 1
     assert not any("." in line or "options options" in line for line in headings)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(encoding, monkeypatch) -> None:
+    """`--help-all` describes each."""
+    texts = []
+    for option in ("--help", "--help-all"):
+        stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        monkeypatch.setattr("sys.stdout", stream)
+        with pytest.raises(SystemExit):
+            run(["export", option])
+        stream.seek(0)
+        texts.append(stream.read())
+    short, every = texts
+    assert short.count("\n") < 60 < 120 < every.count("\n") and "--help-all" in short
+    assert short.index("--out PATH") < short.index("--overwrite") < short.index("--refine")
+    options = set(re.findall(r"^(?:│ |  )(--\w[\w-]*)", every, re.MULTILINE))
+    assert len(options) > 25 and options <= set(re.findall(r"--[a-z][a-z-]*", short))
 
 
 # Commands (`room`: a folder of panoramas, `scene.ply`: a scene), and what their message has.

@@ -184,9 +184,9 @@ def run(argv: Sequence[str] | None = None) -> int:
         import tyro
 
         command = parse_arguments(
-            lambda: tyro.cli(
+            lambda args: tyro.cli(
                 Command,  # pyright: ignore[reportArgumentType]
-                args=argv,
+                args=args,
                 prog="pansplat-homes",
                 description="Make the data and the weights that pansplat ships.",
             ),
