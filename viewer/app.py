@@ -89,11 +89,8 @@ class Options:
 def run_arguments(args: Sequence[str] | None = None) -> int:
     """Run the command with these arguments, those of the process by default, and return its exit status."""
     options = parse_arguments(
-        lambda arguments: tyro.cli(
-            Options,
-            args=arguments,
-            prog="pansplat-view",
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+        lambda args: tyro.cli(
+            Options, args=args, prog="pansplat-view", config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
         ),
         "pansplat-view",
         args,

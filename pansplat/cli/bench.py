@@ -67,8 +67,7 @@ class BenchRaster(_Options):
     quick: bool = False
     """Fewer repeats, and 128 rows by default: about 20 seconds on two idle cores."""
     height: Annotated[int, Meta(ge=16, le=8192, multiple_of=8)] | None = None
-    """Height of the panoramas, pixels, 512 by default; a multiple of 8. Cube faces, the official drawing and the sample
-    have three eighths of it."""
+    """Height of the panoramas, pixels, 512 by default; a multiple of 8."""
 
     def run(self) -> int:
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""

@@ -75,8 +75,6 @@ class PoseCheck:
         error: photometric error of the warp with the poses as given: 0 for a perfect fit, about 1 for unrelated images.
         errors: the error for each interpretation of the poses, best first; `AS_GIVEN` is one.
         indistinguishable: interpretations with the same relative pose as given.
-        similar: other interpretations that fit about as well as given or better; level cameras of one height hardly
-            show a flipped up axis, because its relative poses are nearly the same.
         likely_mistake: advice if another interpretation fits clearly better, else None.
         can_judge: whether the views show enough in common to find a mistake; if not, a warning says so.
         warnings: on other implausible input.
@@ -87,10 +85,14 @@ class PoseCheck:
     error: float
     errors: dict[str, float]
     indistinguishable: tuple[str, ...]
-    similar: tuple[str, ...]
     likely_mistake: str | None
     can_judge: bool
     warnings: tuple[str, ...]
+
+    @property
+    def similar(self) -> tuple[str, ...]:
+        """Other interpretations that fit about as well as the poses as given, or better."""
+        return tuple(r for r, error in self.errors.items() if r != AS_GIVEN and error <= _SIMILAR_RATIO * self.error)
 
 
 def check_pair(pair: Pair) -> PoseCheck:
@@ -132,10 +134,7 @@ def check_views(views: Views, name: str = "views") -> PoseCheck:
             "apart have. If they are near each other in one room, the poses or the order of the images are wrong.",
         )
     mistake = _describe_mistake(errors)
-    similar = _list_similar(errors)
-    return PoseCheck(
-        name, baseline, errors[AS_GIVEN], errors, tuple(indistinguishable), similar, mistake, can_judge, warnings
-    )
+    return PoseCheck(name, baseline, errors[AS_GIVEN], errors, tuple(indistinguishable), mistake, can_judge, warnings)
 
 
 def _can_judge(errors: dict[str, float]) -> bool:
@@ -145,12 +144,6 @@ def _can_judge(errors: dict[str, float]) -> bool:
     if _as_given_is_worse(errors):
         return is_distinct and best <= _MAX_ERROR
     return is_distinct or best <= _NO_OVERLAP
-
-
-def _list_similar(errors: dict[str, float]) -> tuple[str, ...]:
-    """The other interpretations that fit about as well as the poses as given, or better."""
-    limit = _SIMILAR_RATIO * errors[AS_GIVEN]
-    return tuple(r for r, error in errors.items() if r != AS_GIVEN and error <= limit)
 
 
 def _as_given_is_worse(errors: dict[str, float]) -> bool:

@@ -343,8 +343,7 @@ class Collection:
         if self.ordered or count == 2:
             return list(itertools.pairwise(members))
         centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
-        # Prim's algorithm from the first panorama; distances of a grid are equal but for rounding
-        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)
+        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)  # Prim's algorithm; a grid has equal ones
         parent = torch.zeros(count, dtype=torch.long)
         outside = torch.ones(count, dtype=torch.bool)
         outside[0] = False

@@ -71,8 +71,7 @@ class Tour:
         groups: the largest one first.
         confirmed: doubtful pairs that agree with the others of their group.
         rejected: pairs that contradict the others.
-        unplaced: for each panorama without a pose why, and what its owner can do, the other panorama of its best pair,
-            and the figures of that pair.
+        unplaced: for each panorama without a pose why, the other panorama of its best pair, and figures of that pair.
     """
 
     groups: tuple[Group, ...]

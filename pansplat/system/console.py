@@ -14,7 +14,6 @@ import shutil
 import signal
 import sys
 import tempfile
-import textwrap
 import threading
 import time
 import traceback
@@ -224,14 +223,11 @@ def own_warnings() -> Iterator[None]:
 def parse_arguments(parse: Callable[[Sequence[str]], _T], program: str, arguments: Sequence[str] | None) -> _T:
     """The result of a parser of arguments, which prints help or an error and raises SystemExit.
 
-    Help that is long describes the options of the command itself, and lists those of its groups; `--help-all` describes
-    all.
-
     Args:
         parse: tyro's parser of some arguments.
         program: name of the command.
-        arguments: None for those of the process. `--version` prints the version and exits;
-            `--tyro-print-completion SHELL` prints a script for the completion of arguments.
+        arguments: None for those of the process. `--version` prints the version and exits, `--help-all` help of all
+            options; `--tyro-print-completion SHELL` prints a script for the completion of arguments.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
@@ -241,7 +237,6 @@ def parse_arguments(parse: Callable[[Sequence[str]], _T], program: str, argument
         raise SystemExit(0)
     from pansplat.system.options import NUMBERS
 
-    # tyro draws boxes as the encoding allows
     printed = io.TextIOWrapper(io.BytesIO(), encoding=getattr(sys.stdout, "encoding", None) or "utf-8")
     width = os.environ.get("COLUMNS")
     is_script, is_short = given[:1] == [_COMPLETION], not {"-h", "--help"}.isdisjoint(given)
@@ -251,16 +246,15 @@ def parse_arguments(parse: Callable[[Sequence[str]], _T], program: str, argument
         with NUMBERS, contextlib.redirect_stdout(printed if is_script or is_short else sys.stdout):
             return parse(["--help" if argument == _ALL else argument for argument in given])
     finally:
-        columns = shutil.get_terminal_size().columns
         os.environ.pop("COLUMNS", None)
         os.environ |= {} if width is None else {"COLUMNS": width}
         # The shell would read the second line of a description as another word.
         printed.seek(0)
         text = re.sub(r"\\n(?=.*'type':)", " ", printed.read())
-        print(_shorten_help(text, columns) if is_short else text, end="")
+        print(_shorten_help(text) if is_short else text, end="")
 
 
-def _shorten_help(text: str, columns: int) -> str:
+def _shorten_help(text: str) -> str:
     """Long help with the required options first, and of each further group the names of its options."""
     if text.count("\n") <= _LONG_HELP:
         return text
@@ -271,8 +265,7 @@ def _shorten_help(text: str, columns: int) -> str:
         if group is None:
             shown += first + "".join(sorted(entries[:-1], key=lambda entry: "(required)" not in entry) + entries[-1:])
         else:
-            line = " ".join((f"{group[1]}:", *re.findall(r"(?m)^(?:│ |  )(--?\w[\w-]*)", block)))
-            names += textwrap.fill(line, columns, subsequent_indent="    ", break_on_hyphens=False) + "\n"
+            names += " ".join((f"  {group[1]}:", *re.findall(r"(?m)^(?:│ |  )(--?\w[\w.-]*)", block))) + "\n"
     return f"{shown}More options; {_ALL} describes them:\n{names}" if names else shown
 
 

@@ -40,7 +40,7 @@ def test_check_exits_with_1_if_the_convention_is_wrong(shared: Path, capsys: pyt
 
 def test_check_is_undecided_between_what_fits_about_as_well(pair_folder: Path, monkeypatch, capsys) -> None:
     errors = {"as given": 0.445, "mirrored up-down": 0.450}
-    found = PoseCheck("a", 2.0, 0.445, errors, (), ("mirrored up-down",), None, True, ())
+    found = PoseCheck("a", 2.0, 0.445, errors, (), None, True, ())
     monkeypatch.setattr("pansplat.evaluation.pose_check.check_pair", lambda pair: found)
     assert run(["check", str(pair_folder)]) == 0
     printed = "undecided between as given (0.445) and what fits about as well: mirrored up-down (0.450)"

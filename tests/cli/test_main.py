@@ -17,6 +17,7 @@ import pansplat
 from pansplat.cli import run
 from pansplat.errors import InputError, InputWarning
 from pansplat.system.console import own_warnings
+from pansplat.training.__main__ import run as train
 
 
 def run_program(program: str) -> str:
@@ -86,22 +87,27 @@ def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, mon
     assert not any("." in line or "options options" in line for line in headings)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
-def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(encoding, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("command", "encoding"), [((run, "export"), "utf-8"), ((run, "export"), "ascii"), ((train, "tiny"), "utf-8")]
+)
+def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(
+    command, encoding, monkeypatch
+) -> None:
     """`--help-all` describes each."""
     texts = []
     for option in ("--help", "--help-all"):
         stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
         monkeypatch.setattr("sys.stdout", stream)
         with pytest.raises(SystemExit):
-            run(["export", option])
+            command[0]([command[1], option])
         stream.seek(0)
         texts.append(stream.read())
     short, every = texts
     assert short.count("\n") < 60 < 120 < every.count("\n") and "--help-all" in short
-    assert short.index("--out PATH") < short.index("--overwrite") < short.index("--refine")
-    options = set(re.findall(r"^(?:│ |  )(--\w[\w-]*)", every, re.MULTILINE))
-    assert len(options) > 25 and options <= set(re.findall(r"--[a-z][a-z-]*", short))
+    if command[1] == "export":
+        assert short.index("--out PATH") < short.index("--overwrite") < short.index("--refine")
+    options = set(re.findall(r"^(?:│ |  )(--\w[\w.-]*)", every, re.MULTILINE))
+    assert len(options) > 25 and options <= set(re.findall(r"--[a-z][\w.-]*", short))
 
 
 # Commands (`room`: a folder of panoramas, `scene.ply`: a scene), and what their message has.

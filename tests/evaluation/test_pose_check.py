@@ -13,7 +13,6 @@ from pansplat.evaluation.pose_check import (
     PoseCheck,
     _can_judge,
     _describe_mistake,
-    _list_similar,
     check_pair,
     check_views,
 )
@@ -128,7 +127,8 @@ def test_interpretations_with_the_same_relative_pose_are_indistinguishable_and_n
 
 def test_interpretations_that_fit_about_as_well_are_named() -> None:
     errors = {"inverse": 0.443, AS_GIVEN: 0.445, "mirrored up-down": 0.450, "swapped views": 0.470}
-    assert _list_similar(errors) == ("inverse", "mirrored up-down")
+    check = PoseCheck("pair", 1.0, 0.445, errors, (), None, True, ())
+    assert check.similar == ("inverse", "mirrored up-down")
 
 
 def test_three_views_are_checked_together() -> None:
