@@ -5,27 +5,21 @@ too far. The search places what two cameras see, and finds false matches where o
 therefore kept, and multiplied by a smooth field, which the search's reliable matches determine: the logarithm of the
 field is a sum of fields from a nearly constant one to one of some pixels. A field does not cross discontinuities of the
 single view's surface, or those that dense evidence shows. A finer field follows only enough evidence.
-
-Source: the smoother is the fast global smoother of Min et al., IEEE Transactions on Image Processing 23(12), 2014, with
-rows and meridians as closed lines, so that it has neither seam nor pole.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
+from pansplat.sweep.smoothing import as_meridians, smooth_sphere
 from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphere, world_points
 
-_PASSES = 2  # of a smoothing, over rows and meridians
 _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the field is the median of all pixels
-_MAX_ROW_COUPLING = 1e3  # of neighbouring pixels in a row, which are close to each other at the poles
 
 
 # Evidence
@@ -112,12 +106,12 @@ def fit_field(
     weight = evidence * area
     is_known = weight.sum() > _MIN_EVIDENCE * area.sum() * target.shape[1]
     field = np.full(target.shape, _weighted_median(target, weight if is_known else area + 0 * target))
-    rows, meridians = _couple(target, evidence, log_depth, area)
+    rows, meridians = _couple(target, evidence, log_depth)
     for smoothness, stiffness, outlier in zip(_SMOOTHNESS, _STIFFNESS, _OUTLIER, strict=True):
         for _ in range(_ITERATIONS):
             rest = target - field
             weighted = weight / (1 + (rest / outlier) ** 2)
-            sums = _smooth(np.stack((weighted * rest, weighted)), rows, meridians, smoothness)
+            sums = smooth_sphere(np.stack((weighted * rest, weighted)), rows, meridians, smoothness)
             field = field + sums[0] / (sums[1] + stiffness * area + 1e-9)
     return field
 
@@ -128,91 +122,15 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values.ravel()[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-def _couple(
-    target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray, area: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Couplings of each pixel with the next one of its row, and of its meridian as `_as_meridians` has them."""
+def _couple(target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Couplings of each pixel with the next one of its row, and of its meridian as `as_meridians` has them."""
     dense = cv2.boxFilter(pad_sphere(evidence.astype(np.float32), 2), -1, (5, 5))[2:-2, 2:-2]
     found = cv2.medianBlur(pad_sphere(target.astype(np.float32), 2), 5)[2:-2, 2:-2]  # without single false matches
     maps = np.stack((log_depth, found, dense)).astype(np.float64)
     couplings = []
-    for lines in (maps, _as_meridians(maps)):
+    for lines in (maps, as_meridians(maps)):
         following = np.roll(lines, -1, axis=-1)
         jumps, field_jumps, _ = np.abs(following - lines)
         field_jumps = np.maximum(field_jumps - _SLOPE, 0) * np.minimum(lines[2], following[2])
         couplings.append(np.exp(-(jumps + field_jumps) / _DISCONTINUITY))
-    return couplings[0] * np.minimum(1 / np.maximum(area, 1e-6) ** 2, _MAX_ROW_COUPLING), couplings[1]
-
-
-def _as_meridians(maps: np.ndarray) -> np.ndarray:
-    """Panoramas (..., h, 2h) as closed lines (..., h, 2h): down a meridian, and up the opposite one."""
-    half = maps.shape[-1] // 2
-    lines = np.concatenate((maps[..., :half], maps[..., ::-1, half:]), axis=-2)
-    return np.ascontiguousarray(np.swapaxes(lines, -1, -2))
-
-
-def _from_meridians(lines: np.ndarray) -> np.ndarray:
-    """The panoramas of `_as_meridians`."""
-    maps, half = np.swapaxes(lines, -1, -2), lines.shape[-2]
-    return np.ascontiguousarray(np.concatenate((maps[..., :half, :], maps[..., : half - 1 : -1, :]), axis=-1))
-
-
-def _smooth(maps: np.ndarray, rows: np.ndarray, meridians: np.ndarray, smoothness: float) -> np.ndarray:
-    """Panoramas (2, h, w), smoothed by alternate one-dimensional smoothings of falling strength."""
-    for number in range(_PASSES):
-        strength = 1.5 * 4.0 ** (_PASSES - 1 - number) / (4.0**_PASSES - 1) * smoothness
-        smooth_lines(maps, rows, strength)
-        maps = _as_meridians(maps)
-        smooth_lines(maps, meridians, strength)
-        maps = _from_meridians(maps)
-    return maps
-
-
-def smooth_lines(maps: np.ndarray, couplings: np.ndarray, strength: float) -> None:
-    """Smooth closed lines in place, along the last axis of both maps (2, lines, length).
-
-    Args:
-        couplings: (lines, length) of each value with the next one of its line.
-        strength: square of the length over which values of full coupling are averaged.
-    """
-    parallel_for(partial(_smooth_line, maps, couplings, strength), len(couplings), thread_count())
-
-
-@cached_njit(nogil=True, fastmath=True, error_model="numpy")
-def _smooth_line(maps, couplings, strength, line):
-    """Smooth line `line` of both maps (2, n, length) in place.
-
-    It solves (1 + strength * L) x = b for the Laplacian L of a closed line: a tridiagonal system with two corners, by
-    the Sherman-Morrison formula.
-    """
-    coupling, length = couplings[line], couplings.shape[1]
-    upper, turn = np.empty(length), np.empty(length)
-    first, second = maps[0, line], maps[1, line]
-    corner = -strength * coupling[length - 1]
-    gamma = -(1 + strength * (coupling[length - 1] + coupling[0]))
-    inverse = -0.5 / gamma  # of the pivot
-    upper[0], turn[0] = -strength * coupling[0] * inverse, -0.5
-    first[0] *= inverse
-    second[0] *= inverse
-    for k in range(1, length):
-        lower = -strength * coupling[k - 1]
-        diagonal = 1 + strength * (coupling[k - 1] + coupling[k])
-        last = 0.0
-        if k == length - 1:
-            diagonal -= corner * corner / gamma
-            last = corner
-        inverse = 1 / (diagonal - lower * upper[k - 1])
-        upper[k] = -strength * coupling[k] * inverse
-        first[k] = (first[k] - lower * first[k - 1]) * inverse
-        second[k] = (second[k] - lower * second[k - 1]) * inverse
-        turn[k] = (last - lower * turn[k - 1]) * inverse
-    for k in range(length - 2, -1, -1):
-        first[k] -= upper[k] * first[k + 1]
-        second[k] -= upper[k] * second[k + 1]
-        turn[k] -= upper[k] * turn[k + 1]
-    ratio = corner / gamma
-    scale = 1 + turn[0] + ratio * turn[length - 1]
-    one, two = (first[0] + ratio * first[length - 1]) / scale, (second[0] + ratio * second[length - 1]) / scale
-    for k in range(length):
-        first[k] -= one * turn[k]
-        second[k] -= two * turn[k]
+    return couplings[0], couplings[1]

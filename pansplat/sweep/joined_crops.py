@@ -38,10 +38,16 @@ def crop_panorama(
     panorama: Float[Tensor, "3 height width"], size: tuple[int, int]
 ) -> Float[Tensor, "crop 3 crop_height crop_width"]:
     """The perspective crops, of a size (height, width), that a network is given of a panorama."""
-    extent = _extent(size)
-    x, y = ((torch.arange(n).double() * 2 + 1 - n) / n * e for n, e in zip(size[::-1], extent, strict=True))
-    rays = torch.stack((x.expand(size), y[:, None].expand(size), torch.ones(size, dtype=torch.float64)), dim=-1)
+    rows, columns = (torch.arange(n, dtype=torch.float64) for n in size)
+    rays = pixel_rays(torch.stack((columns.expand(size), rows[:, None].expand(size)), dim=-1), size)
     return torch.stack([sample_equirect(panorama, uv_from_directions(rays @ axes.T)) for axes in crop_axes()])
+
+
+def pixel_rays(pixels: Float[Tensor, "*batch 2"], size: tuple[int, int]) -> Float[Tensor, "*batch 3"]:
+    """Rays in a crop's axes of columns and rows; the first pixel's centre is (0, 0)."""
+    counts = pixels.new_tensor(size[::-1])
+    plane = (pixels * 2 + 1 - counts) / counts * pixels.new_tensor(_extent(size))
+    return torch.cat((plane, torch.ones_like(plane[..., :1])), dim=-1)
 
 
 def join_crops(

@@ -5,7 +5,7 @@ volume (PanSplat, section 3.2). The coarse level searches the whole depth range 
 scene's axes. Each finer level searches a narrow range around the coarser surface, which gives occlusion and
 consistency between views. With a prior, the surfaces of the finest level and of the result are those of single views,
 bent by the matches (`bend`). A prior of accurate shapes replaces the search of the whole range: all levels then search
-near the surfaces of single views. Vertical edges are straightened at last (`straighten`).
+near the surfaces of single views. At last all surfaces are made whole (`whole`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ from pansplat.sweep.matching import (
     select_labels,
 )
 from pansplat.sweep.prior import DepthPrior, PriorEstimator, PriorModel, apply_prior_cost
-from pansplat.sweep.straighten import straighten
 from pansplat.sweep.surface import (
     PosedImages,
     Surface,
@@ -48,8 +47,10 @@ from pansplat.sweep.surface import (
     resize_sharp,
     resize_sphere,
 )
+from pansplat.sweep.whole import make_whole
 from pansplat.system.progress import report_progress
 
+_STEP = 0.6  # metres that a camera moves from a view alone
 _SMALL_HEIGHT = 96  # pixels, of the panoramas in which heights of the cameras over the floor are compared
 
 
@@ -143,12 +144,13 @@ def search(scene: ObservedScene) -> list[Surface]:
     else:  # nothing is known: spheres in the middle of the range
         inverse = np.full((finest, 2 * finest), 0.5 * (1 / posed.near + 1 / posed.far), np.float32)
         return [Surface(inverse)] * len(posed.images)
-    straight = []
-    for surface, axes, image, pose in zip(surfaces, scene.axes, posed.images, posed.cam2world, strict=True):
-        down = pose[:3, :3].T @ axes[0]
-        log_depth = straighten(-np.log(surface.inverse_depth), image, down)
-        straight.append(Surface(np.exp(-log_depth).clip(*scene.depths.limits)))
-    return straight
+    # A view alone is left by a step; others by a flight to the best neighbour.
+    distances = measure_distances(posed.cam2world)
+    baselines = [distances[view, others[0]] if others else 0.0 for view, others in enumerate(scene.neighbours)]
+    return [
+        Surface(make_whole(surface.inverse_depth, image, max(baseline, _STEP)).clip(*scene.depths.limits))
+        for surface, image, baseline in zip(surfaces, posed.images, baselines, strict=True)
+    ]
 
 
 def _search(scene: ObservedScene, finest_posed: PosedImages) -> list[Surface]:
@@ -167,23 +169,21 @@ def _search(scene: ObservedScene, finest_posed: PosedImages) -> list[Surface]:
         level.search_full_range(view, depths.sample(count), priors)
         for view, (count, priors) in enumerate(zip(counts, scene.priors, strict=True))
     ]
-    sharp = None
-    if estimator is not None:
-        sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen()]
     for n, height in enumerate(heights[1:]):
         report_progress("refining the surfaces", 0.55 + 0.1 * n)
         surfaces = [
             guided_upsample(surface, resize_sphere(image, surface.height), resize_sphere(image, height))
             for surface, image in zip(surfaces, posed.images, strict=True)
         ]
-        if sharp is not None and height == finest:
-            surfaces = bend_surfaces(finest_posed, surfaces, neighbours, sharp)
         level = _SearchLevel(scene, height, surfaces)
         surfaces = [
             level.refine(view, _NARROW_CANDIDATES[n], depths.step(count) / 2 ** (n + 1), widen=n == 0)
             for view, count in enumerate(counts)
         ]
-    return surfaces if sharp is None else bend_surfaces(finest_posed, surfaces, neighbours, sharp)
+    if estimator is None:
+        return surfaces
+    sharp = [resize_sphere(log_depth, finest) for log_depth in estimator.sharpen()]
+    return bend_surfaces(finest_posed, surfaces, neighbours, sharp)
 
 
 def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> list[Surface]:
