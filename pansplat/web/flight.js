@@ -16,7 +16,7 @@ const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into on
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
 const NEAR = HEADER.speed;          // metres: a second's walk
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
-const PHOTO_WAIT_MS = 2000;         // of a fade along a poor edge, at most, for the photograph where it ends
+export const PHOTO_WAIT_MS = 2000;  // for a photograph, at most: of a fade along a poor edge where it ends, and of the first Gaussians
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
 // `zoom`: of the image of before, by which a fast fade along a poor edge looks like a step.
@@ -311,7 +311,7 @@ export function updateStill(now) {
   if (!state.still) return;
   state.still.taken ??= now;
   state.still.position = state.still.position || [...camera.position];
-  const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR;
+  const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR + distanceOf(camera.position, state.still.position);
   const isThere = state.still.zoom === null || !photographs.isExpected || now - state.still.taken > PHOTO_WAIT_MS;
   if (state.still.began === null && isSorted && isThere && isSeen()) state.still.began = now;
   if (state.still.began !== null) {

@@ -17,7 +17,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -142,6 +142,39 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
             origins.append(f"http://127.0.0.1:{server.server_port}")
         ORIGINS[folder] = origins[0]
         yield Sites(folder, *origins)
+
+
+class FaultyHandler(QuietHandler):
+    """Drops, delays and replaces files by their names, as often as `faults` has it."""
+
+    faults: ClassVar[dict[str, list[str]]] = {}
+
+    def do_GET(self) -> None:
+        waiting = self.faults.get(self.path.rsplit("/")[-1], [])
+        fault = waiting.pop(0) if waiting else None
+        if fault == "html":
+            self.path = "/host.html"
+        elif fault == "half":
+            content = Path(self.translate_path(self.path)).read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content[: len(content) // 2])
+            self.wfile.flush()
+        if fault in ("half", "silence"):
+            time.sleep(2 * LIMIT)
+        elif fault != "drop":
+            super().do_GET()
+
+
+@pytest.fixture
+def faulty(folder: Path) -> Iterator[str]:
+    """Origin of a FaultyHandler that shows the folder."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(FaultyHandler, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        FaultyHandler.faults.clear()
+        server.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -931,10 +964,82 @@ def read_failure(chromium: Any, path: Path | str) -> str:
     return message
 
 
+FAST = """(({ setTimeout }) => {  // silence and pauses between tries are short
+    window.setTimeout = (act, ms, ...values) => setTimeout(act, ms > 1000 && ms !== 5000 ? ms / 10 : ms, ...values);
+})(window);"""
+FAULTS = ("drop", "silence", "half", "html")
+
+
+def list_files(path: Path) -> tuple[list[str], list[str]]:
+    """The .bin of each view and the first tile of each photograph of a page."""
+    (header,) = re.findall(r"^const HEADER = (.*);$", path.read_text(), flags=re.MULTILINE)
+    header = json.loads(header)
+    files = [view["files"][0] for view in header["views"]]
+    return files, [f"{photograph['name']}_0.jpg" for photograph in header["photographs"]]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_file_that_does_not_arrive_is_read_again(chromium: Any, folder: Path, faulty: str, fault: str) -> None:
+    files, tiles = list_files(folder / "poor" / "index.html")
+    FaultyHandler.faults |= {name: [fault, fault] for name in (files[0], files[2], tiles[0], tiles[2])}
+    with opened(chromium, f"{faulty}/poor/index.html", script=FAST) as page:
+        page.settle()
+        assert page.run("pansplat.goTo(3, { jump: true })")
+        page.settle()
+        assert not any(FaultyHandler.faults.values()) and page.page.inner_text("#status") == ""
+        page.run("pansplat.setPose({ position: HEADER.spots[2].position.map((x) => x + 0.1) })")
+        page.settle()
+        assert page.draw().std() > 0.05 and page.page.is_hidden("#cover")
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_part_that_does_not_arrive_ends_no_page_and_is_shown_when_it_does(
+    chromium: Any, folder: Path, faulty: str, fault: str
+) -> None:
+    files, _ = list_files(folder / "hosted.html")
+    FaultyHandler.faults[files[2]] = [fault] * 4
+    with opened(chromium, f"{faulty}/hosted.html", script=FAST) as page:
+        page.run("groups = HEADER.groups[1], HEADER.groups[1] = [2], 0")  # nothing else is seen there
+        assert page.run("pansplat.goTo(3, { jump: true })"), "the fade ends"
+        assert page.page.inner_text("#status") == "A part of the scene at room 2 cannot be loaded yet"
+        assert page.page.is_hidden("#cover") and page.draw().std() < 0.01
+        page.wait(f"performance.getEntriesByName(new URL('hosted_files/{files[2]}', location)).length > 4")
+        page.settle()
+        assert page.draw().std() > 0.05
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_tile_that_does_not_arrive_does_not_delay_the_gaussians(
+    chromium: Any, folder: Path, faulty: str, fault: str
+) -> None:
+    _, tiles = list_files(folder / "photos" / "index.html")
+    FaultyHandler.faults |= {tile: [fault] * 9 for tile in tiles}
+    endless = STAY.replace("5000", "10000")  # silence
+    with opened(chromium, f"{faulty}/photos/index.html", script=endless) as page:
+        page.wait("document.getElementById('view').ariaBusy === 'false'")
+        page.run("pansplat.setPose({ position: HEADER.spots[2].position.map((x) => x + 0.1) })")
+        page.settle()
+        assert page.draw().std() > 0.05
+
+
+def test_a_fade_ends_though_the_camera_walks_away_before_the_gaussians_arrive(chromium: Any, folder: Path) -> None:
+    late = HOLD + "isHolding = ({ chunk, view }) => chunk && view === 2;"
+    with opened(chromium, folder / "house.html", script=late, is_stepped=True) as page:
+        page.run("pansplat.goTo(3, { jump: true }), HEADER.groups[1] = [2], 0")
+        page.page.keyboard.down("KeyS")
+        away = "Math.hypot(...pansplat.camera.position.map((x, i) => x - HEADER.spots[2].position[i]))"
+        page.wait(f"{away} > 1.1 * HEADER.speed")
+        page.page.keyboard.up("KeyS")
+        assert page.page.is_visible("#still")
+        page.run("release()")
+        page.settle()
+        assert page.page.is_hidden("#still")
+
+
 def test_missing_parts_are_named(chromium: Any, folder: Path) -> None:
     (folder / "alone").mkdir()
     shutil.copy(folder / "split.html", folder / "alone")
-    assert "Copy the whole folder" in read_failure(chromium, folder / "alone" / "split.html")
+    assert "copy the whole folder" in read_failure(chromium, folder / "alone" / "split.html")
 
 
 def test_a_folder_that_is_opened_from_disk_says_what_to_do(chromium: Any, folder: Path) -> None:
