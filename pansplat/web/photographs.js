@@ -120,7 +120,7 @@ class Photographs {
   // The panorama at which the camera stands.
   findNode() {
     const node = nodeHere();
-    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
+    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS ? node : null;
   }
 
   // Whether the photograph at the camera, which is not shown yet, may arrive soon.
@@ -176,7 +176,7 @@ class Photographs {
     this.read(this.wanted, size);
     const isShown = isStill && node !== null && !state.headset.session && this.levelsOf(node)[0].isReady;
     if (this.node !== null && node !== this.node) {
-      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
+      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / GONE;
       this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
     }
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
