@@ -3,7 +3,7 @@
 
 import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
 import { chooseArrival, findLink } from "./choices.js";
-import { findHouse, frameDoll, isInDoll, nearestInDoll } from "./doll.js";
+import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import {
   clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
@@ -102,7 +102,7 @@ function setDoll(isOn, isDue = false) {
   changed();
 }
 
-function flyDoll(target, then = () => {}) {
+function flyDoll(target, then = () => orbit(0, 0)) {
   const start = { ...camera, position: [...camera.position] };
   state.doll.flight = { start, target, then, began: null, seconds: calm.matches ? 0 : DOLL_SECONDS };
   changed();
@@ -245,7 +245,7 @@ export function advanceRoute(seconds) {
 export function setTouring(value) {
   if (state.doll.isDue) setDoll(false);  // another way replaces it
   state.isTouring = value && HEADER.spots.length > 1;
-  if (state.isTouring && state.doll.isOn) jumpTo(state.doll.node);
+  if (state.isTouring && state.doll.isOn) jump(GRAPH.positions[state.doll.node], state.doll.heading);
   byId("play").setAttribute("aria-pressed", state.isTouring);
   byId("play").querySelector("path").setAttribute("d", state.isTouring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
   if (!state.isTouring) Object.assign(state, { flight: null, route: null });

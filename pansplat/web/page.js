@@ -87,7 +87,7 @@ async function main() {
   makeRings();
   makeList();
   makeNotes();
-  embed.listen(canvas, window.pansplat);
+  embed.listen([canvas, byId("spots")], window.pansplat);
   onFrame(performance.now());
   byId("cover").className = "done";
   setTimeout(() => { byId("cover").hidden = !failure; }, 700);
