@@ -170,14 +170,19 @@ export function advanceFlight(now) {
   }
   if (state.flight.began === null) beginLeg(leg, now);
   const t = leg.seconds ? clamp((now - state.flight.began) / (1000 * leg.seconds), 0, 1) : 1;
-  if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
-  turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
-  leg.done = ease(t);
-  changed();
+  const isMoving = leg.length > 0 || leg.turn.some((angle) => angle);
+  if (isMoving) {
+    if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
+    turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
+    leg.done = ease(t);
+  }
   if (t < 1) return;
   state.flight.began = null;
   state.flight.legs.shift();
-  if (state.flight.legs.length) return;
+  if (state.flight.legs.length) {
+    if (!isMoving) advanceFlight(now);  // a fade begins with the picture at rest, which has the full resolution
+    return;
+  }
   const { spot } = state.flight;
   state.flight = null;
   if (state.isTouring) flyTo((spot + 1) % HEADER.spots.length);
@@ -313,7 +318,7 @@ export function updateStill(now) {
   state.still.position = state.still.position || [...camera.position];
   const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR + distanceOf(camera.position, state.still.position);
   const isThere = state.still.zoom === null || !photographs.isExpected || now - state.still.taken > PHOTO_WAIT_MS;
-  if (state.still.began === null && isSorted && isThere && isSeen()) state.still.began = now;
+  if (state.still.began === null && (photographs.isOpaque || isSorted && isThere && isSeen())) state.still.began = now;
   if (state.still.began !== null) {
     const t = clamp((now - state.still.began) / (state.still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
     state.still.left = 1 - t * t * (3 - 2 * t);
@@ -334,8 +339,11 @@ function showStill() {
 // Whether a view of the group at the camera is sorted, or all are empty.
 const isSeen = () => state.doll.isOn || HEADER.groups[state.group].some((view) => state.sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
-// Whether nothing moves yet: the Gaussians have not arrived, or an image covers them.
-export const isWaiting = () => !state.sorted || state.still !== null && state.still.began === null;
+// Whether nothing moves yet: the Gaussians have not arrived, or are not sorted, or an image covers them.
+export const isWaiting = () => {
+  const { sorted, still, doll } = state;
+  return !sorted || still !== null && still.began === null || !doll.isOn && sorted.part !== currentPart();
+};
 
 // How much of the picture the image covers, or the black in a headset.
 export const coverage = () => state.still ? state.still.left : 0;

@@ -182,7 +182,7 @@ class Photographs {
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
-    const step = seconds / PHOTO_FADE;
+    const step = state.still?.began === null ? 1 : seconds / PHOTO_FADE;  // the still covers it
     this.opacity = clamp(this.target, this.opacity - step, this.opacity + step);
     changed();
   }

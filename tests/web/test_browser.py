@@ -1299,6 +1299,33 @@ def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panor
         assert page.messages == []
 
 
+def test_a_fade_begins_with_the_picture_at_rest(chromium: Any, folder: Path) -> None:
+    """The resolution has fallen in motion."""
+    width = "document.getElementById('view').width"
+    with opened(chromium, folder / "house.html", is_stepped=True) as page:
+        page.settle()
+        page.run("HEADER.poor.push([0, 1]), HEADER.spots.forEach((spot) => { spot.turned = 0; })")
+        for yaw in range(8):
+            page.run(f"pansplat.setPose({{ yaw: {yaw} }}), step(90)")
+        assert page.run(width) < 0.6 * SIZE[0]
+        page.settle()
+        seen = page.draw()
+        page.settle()
+        page.run(f"pansplat.goTo(2), step({FRAME_MS})")
+        assert page.page.is_visible("#still"), "no other picture before"
+        assert psnr(decode(page.run("document.getElementById('still').toDataURL()")), seen) > 45
+
+
+def test_a_fade_to_a_photograph_does_not_wait_for_the_order_of_the_gaussians(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "poor" / "index.html", script=HOLD, is_stepped=True) as page:
+        page.settle()
+        page.run("isHolding = ({ position }) => position, pansplat.goTo(2), 0")
+        page.wait("Number(document.getElementById('still').style.opacity) < 0.5", 10)
+        page.run("release()")
+        page.settle()
+        assert page.page.is_hidden("#still")
+
+
 @pytest.mark.slow
 def test_the_image_of_another_room_stays_until_the_start_is_sorted(chromium: Any, folder: Path) -> None:
     with opened(chromium, folder / "house.html", script=HOLD + FRAMES) as page:
