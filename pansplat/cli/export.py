@@ -102,6 +102,7 @@ class _Mesh:
         """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
         from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
         from pansplat.export.mesh_files import remove_old_meshes, save_mesh
+        from pansplat.images.blur_masks import fill_hidden
         from pansplat.tours.doll_house import find_rooms
         from pansplat.tours.facts import TourFacts
         from pansplat.tours.graph import make_graph, select_views
@@ -109,8 +110,8 @@ class _Mesh:
         scene, photographs = export.open()
 
         def load(view: int) -> Tensor:
-            pair = photographs[view]
-            return pair.load_context(min(pair.image_height, _TEXTURE_HEIGHT)).images[0]
+            views = photographs[view].load_context(min(photographs[view].image_height, _TEXTURE_HEIGHT))
+            return fill_hidden(views.images[0], views.masks[0])
 
         places = sorted(make_graph(scene).list_parts(), key=len, reverse=True) if scene.overlaps else []
         meshes = {}
@@ -229,7 +230,8 @@ def _name_page(path: Path, photographs: Sequence[Pair]) -> str:
     if photographs and is_web_tour_file(named):
         named = named.parent
     tour = photographs[0].context[0].tour if photographs else ""
-    return tour or named.stem.replace("_", " ")
+    name = named.name if named.is_dir() else named.stem.removesuffix(".compressed")
+    return tour or name.replace("_", " ")
 
 
 @dataclass(frozen=True)

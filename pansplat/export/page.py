@@ -687,12 +687,12 @@ def _write_files(
     files = [folder / name for name in parts]
     if split:
         _make_folder(folder)
-    for file, part in zip(files, parts.values(), strict=True):
-        with replacing(file) as temporary:
-            temporary.write_bytes(part)
-    with replacing(path) as temporary:
-        temporary.write_bytes(page)
-    _remove_old_parts(folder, set(parts))
+    with replacing(path) as temporary_page:  # the page appears last; with it, other exports see which parts it needs
+        temporary_page.write_bytes(page)
+        for file, part in zip(files, parts.values(), strict=True):
+            with replacing(file) as temporary:
+                temporary.write_bytes(part)
+    _remove_old_parts(folder)
     files.insert(0, path)
     total = len(page) + sum(map(len, parts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
@@ -712,11 +712,19 @@ def _make_folder(folder: Path) -> None:
         ) from error
 
 
-def _remove_old_parts(folder: Path, kept: set[str]) -> None:
-    """Remove the parts of the page that was replaced, by their names and content, and the folder if that empties it."""
-    name = re.compile(r"[0-9a-f]{16}(_\d+)?\.(js|bin|jpg)")
-    old = [file for file in folder.glob("*") if file.name not in kept and name.fullmatch(file.name)]
-    old = [file for file in old if is_written(file)]
+def _remove_old_parts(folder: Path) -> None:
+    """Remove the parts that no page beside the folder needs, by their names and content, and the folder if that empties
+    it. A page of another export that is being written has a temporary name there (`replacing`)."""
+    name = re.compile(r"([0-9a-f]{16})(_\d+)?\.(js|bin|jpg)")
+    found = [(file, part[1]) for file in folder.glob("*") if (part := name.fullmatch(file.name)) and is_written(file)]
+    needed, address = set(), f'"folder": {_to_script(quote(os.fsencode(folder.name)))}'.encode()
+    for page in folder.parent.glob("*.htm*") if found else ():
+        with suppress(IsADirectoryError):
+            content = page.read_bytes()
+            needed |= {
+                digits.decode() for digits in re.findall(rb"[0-9a-f]{16}", content if address in content else b"")
+            }
+    old = [file for file, digits in found if digits not in needed]
     for file in old:
         with suppress(OSError):
             file.unlink()

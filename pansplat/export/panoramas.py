@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pansplat.images.blur_masks import fill_hidden
 from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.pairs import Panorama, is_panorama_name
 from pansplat.inputs.photographs import LINKS, describe_notes
 from pansplat.system.files import make_unique_name
 from pansplat.system.progress import report_progress, stage
@@ -17,10 +18,10 @@ from pansplat.system.progress import report_progress, stage
 
 @stage()
 def write_panoramas(folder: Path, panoramas: Sequence[Panorama]) -> int:
-    """Write NAME.jpg for each panorama in its full resolution, NAME_mask.png for a mask, and links.json.
+    """Write NAME.jpg for each panorama in its full resolution, NAME_mask.png for a mask or alpha, and links.json.
 
     If a name is taken, the next panorama of that name gets the name of its folder before its own, and a number if that
-    is taken, too. What blur masks hide is hidden in the files. Poses are not written.
+    is taken, too. What blur masks and alpha hide is hidden in the files. Poses are not written.
 
     Args:
         folder: exists.
@@ -33,9 +34,12 @@ def write_panoramas(folder: Path, panoramas: Sequence[Panorama]) -> int:
     for number, (view, name) in enumerate(zip(panoramas, names, strict=True)):
         report_progress(f"writing {name}.jpg", number / len(panoramas))
         height = read_height(view.image)
-        write_image(folder / f"{name}.jpg", read_panorama(view.image, height)[0], panorama="photograph")
+        image, shown = read_panorama(view.image, height)
+        write_image(folder / f"{name}.jpg", fill_hidden(image, shown), panorama="photograph")
         if view.mask is not None:
-            mask = np.repeat(read_mask(view.mask, height).numpy()[..., None], 3, axis=2)
+            shown &= read_mask(view.mask, height)
+        if not shown.all():
+            mask = shown.numpy()[..., None].repeat(3, axis=2)
             write_image(folder / f"{name}_mask.png", mask.astype(np.uint8) * 255, panorama=False)
     named = {(view.image.parent, view.name): name for view, name in zip(panoramas, names, strict=True)}
     entries = {f"{name}.jpg": _describe(view, named) for view, name in zip(panoramas, names, strict=True)}
@@ -46,11 +50,12 @@ def write_panoramas(folder: Path, panoramas: Sequence[Panorama]) -> int:
 
 
 def _name_files(panoramas: Sequence[Panorama]) -> list[str]:
-    """Distinct names for the files of panoramas."""
+    """Distinct names for the files of panoramas, of which none is that of a mask, depth or hidden file."""
     names: list[str] = []
     for view in panoramas:
-        is_taken = view.name.lower() in map(str.lower, names)
-        name = f"{view.image.parent.resolve().name}_{view.name}" if is_taken else view.name
+        name = view.name if is_panorama_name(f"{view.name}.jpg") else f"{view.name.replace('.', '_').lstrip('_')}_photo"
+        if name.lower() in map(str.lower, names):
+            name = f"{view.image.parent.resolve().name}_{name}"
         names.append(make_unique_name(name, names))
     return names
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pansplat.geometry.cubemap import FACES, face_poses, face_rotations
 from pansplat.geometry.equirect import pad_equirect, uv_from_directions
+from pansplat.images.blur_masks import fill_hidden
 from pansplat.images.image_files import read_height, read_panorama, write_image
 from pansplat.images.rig_images import Lens
 from pansplat.inputs.pairs import Panorama, read_scene_mask
@@ -69,7 +70,7 @@ def write_dataset(
         height = min(read_height(view.image), _MAX_HEIGHT)
         size = 2 * math.ceil(height / math.pi)
         lens = Lens(size / 2, size / 2, size / 2, size / 2, size, size)
-        faces = cut_faces(read_panorama(view.image, height)[0], size)
+        faces = cut_faces(fill_hidden(*read_panorama(view.image, height)), size)
         shown = cut_faces(mask.float().expand(3, -1, -1), size)
         plain = re.sub(r"[^\w.-]+", "_", view.name)  # COLMAP reads no spaces
         stem = f"{number:04d}_{plain}"

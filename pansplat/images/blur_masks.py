@@ -20,8 +20,10 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy
+import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.images.cube_images import BESIDE, CUBE_SUFFIX
@@ -143,6 +145,14 @@ def blur_hidden(color: NDArray[Any], hidden: Bool[NDArray[Any], "height width"])
         values = scipy.ndimage.map_coordinates(blurred[..., channel], places, order=1)
         result[y, x, channel] = np.rint(values) if color.dtype == np.uint8 else values
     return result
+
+
+def fill_hidden(
+    image: Float[Tensor, "3 height width"], shown: Bool[Tensor, "height width"]
+) -> Float[Tensor, "3 height width"]:
+    """A panorama for a file without alpha: what is hidden, and 3 pixels around that filters mix with it, is a blur."""
+    hidden = cv2.dilate((~shown).numpy().astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    return torch.from_numpy(blur_hidden(image.permute(1, 2, 0).numpy(), hidden)).permute(2, 0, 1)
 
 
 def _pull_and_push(

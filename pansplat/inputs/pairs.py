@@ -418,21 +418,20 @@ def find_mask(image: Path, folder: Path) -> Path | None:
     return find_mask_beside(panorama, MASK_SUFFIX) or next(of_folders, None)
 
 
+def is_panorama_name(name: str) -> bool:
+    """Whether the name of a file is that of a panorama, and not of a mask, of depth, or of a hidden file."""
+    path = Path(name)
+    is_picture = path.suffix.lower() in READABLE_SUFFIXES and not name.startswith(".")
+    return is_picture and not f"_{path.stem}".lower().endswith("_depth") and split_mask_name(path) is None
+
+
 def list_panorama_files(folder: Path) -> list[Path]:
     """Panorama files of a folder, sorted by name; without masks and depth files.
 
     Raises:
         InputError: a name is not UTF-8.
     """
-    files = [
-        path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in READABLE_SUFFIXES
-        and not f"_{path.stem}".lower().endswith("_depth")
-        and split_mask_name(path) is None
-        and not path.name.startswith(".")
-        and path.is_file()
-    ]
+    files = [path for path in sorted(folder.iterdir()) if is_panorama_name(path.name) and path.is_file()]
     for file in files:
         require_text(file)
     return files

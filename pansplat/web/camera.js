@@ -58,9 +58,11 @@ export function nearestNode(position) {
 // The panorama at the camera, or that from which it looked at the doll's house.
 export const nodeHere = () => state.doll.isOn ? state.doll.node : nearestNode(camera.position);
 
-// A camera for a pose of share.js, some of whose values may be missing; its position is within the limits.
+// A camera for a pose of share.js, some of whose values may be missing; its position is within the limits. What is missing
+// stays, in the doll's house that of before.
 export function cameraFor({ position, yaw, pitch, fov }) {
-  const found = { ...camera, position: [...camera.position], roll: 0 };
+  const { doll } = state, before = doll.isOn ? { position: GRAPH.positions[doll.node], ...doll.heading, fov: doll.fov } : camera;
+  const found = { ...camera, ...before, position: [...before.position], roll: 0 };
   const check = (name, values) => {
     if (!values.every(Number.isFinite)) throw new Error(`The ${name} of a pose needs finite numbers, got ${JSON.stringify(values)}.`);
   };

@@ -53,6 +53,13 @@ export function orbit(yaw, pitch) {
   changed();
 }
 
+// For a window of another size; during a flight its end follows.
+export function resizeDoll(size) {
+  const { doll } = state;
+  Object.assign(doll, { size, first: fit(doll.offsets, camera.yaw, DOLL_PITCH, size) });
+  orbit(0, 0);
+}
+
 export function zoomDoll(factor) {
   const { doll } = state;
   if (doll.flight) return;

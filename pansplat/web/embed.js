@@ -8,13 +8,13 @@ class Embed {
     this.at = null;
   }
 
-  // `canvas` takes the wheel after a click; `api` hears of arrivals.
-  listen(canvas, api) {
+  // `surfaces` take the wheel after a click; `api` hears of arrivals.
+  listen(surfaces, api) {
     this.api = api;
     if (!this.isFramed) return;
     const engage = (value) => {
       this.isEngaged = value;
-      canvas.style.touchAction = value ? "none" : "pan-y";
+      surfaces.forEach(({ style }) => { style.touchAction = value ? "none" : "pan-y"; });
     };
     engage(false);
     addEventListener("click", () => engage(true));

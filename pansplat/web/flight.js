@@ -3,7 +3,7 @@
 
 import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
 import { chooseArrival, findLink } from "./choices.js";
-import { findHouse, frameDoll, isInDoll, nearestInDoll } from "./doll.js";
+import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import {
   clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
@@ -16,7 +16,7 @@ const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into on
 const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
 const NEAR = HEADER.speed;          // metres: a second's walk
 const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
-const PHOTO_WAIT_MS = 2000;         // of a fade along a poor edge, at most, for the photograph where it ends
+export const PHOTO_WAIT_MS = 2000;  // for a photograph, at most: of a fade along a poor edge where it ends, and of the first Gaussians
 const REST_SECONDS = 4;             // at a panorama, on a tour without flights
 
 // `zoom`: of the image of before, by which a fast fade along a poor edge looks like a step.
@@ -102,7 +102,7 @@ function setDoll(isOn, isDue = false) {
   changed();
 }
 
-function flyDoll(target, then = () => {}) {
+function flyDoll(target, then = () => orbit(0, 0)) {
   const start = { ...camera, position: [...camera.position] };
   state.doll.flight = { start, target, then, began: null, seconds: calm.matches ? 0 : DOLL_SECONDS };
   changed();
@@ -170,14 +170,19 @@ export function advanceFlight(now) {
   }
   if (state.flight.began === null) beginLeg(leg, now);
   const t = leg.seconds ? clamp((now - state.flight.began) / (1000 * leg.seconds), 0, 1) : 1;
-  if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
-  turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
-  leg.done = ease(t);
-  changed();
+  const isMoving = leg.length > 0 || leg.turn.some((angle) => angle);
+  if (isMoving) {
+    if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
+    turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
+    leg.done = ease(t);
+  }
   if (t < 1) return;
   state.flight.began = null;
   state.flight.legs.shift();
-  if (state.flight.legs.length) return;
+  if (state.flight.legs.length) {
+    if (!isMoving) advanceFlight(now);  // a fade begins with the picture at rest, which has the full resolution
+    return;
+  }
   const { spot } = state.flight;
   state.flight = null;
   if (state.isTouring) flyTo((spot + 1) % HEADER.spots.length);
@@ -245,7 +250,7 @@ export function advanceRoute(seconds) {
 export function setTouring(value) {
   if (state.doll.isDue) setDoll(false);  // another way replaces it
   state.isTouring = value && HEADER.spots.length > 1;
-  if (state.isTouring && state.doll.isOn) jumpTo(state.doll.node);
+  if (state.isTouring && state.doll.isOn) jump(GRAPH.positions[state.doll.node], state.doll.heading);
   byId("play").setAttribute("aria-pressed", state.isTouring);
   byId("play").querySelector("path").setAttribute("d", state.isTouring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
   if (!state.isTouring) Object.assign(state, { flight: null, route: null });
@@ -311,9 +316,9 @@ export function updateStill(now) {
   if (!state.still) return;
   state.still.taken ??= now;
   state.still.position = state.still.position || [...camera.position];
-  const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR;
+  const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR + distanceOf(camera.position, state.still.position);
   const isThere = state.still.zoom === null || !photographs.isExpected || now - state.still.taken > PHOTO_WAIT_MS;
-  if (state.still.began === null && isSorted && isThere && isSeen()) state.still.began = now;
+  if (state.still.began === null && (photographs.isOpaque || isSorted && isThere && isSeen())) state.still.began = now;
   if (state.still.began !== null) {
     const t = clamp((now - state.still.began) / (state.still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
     state.still.left = 1 - t * t * (3 - 2 * t);
@@ -334,8 +339,11 @@ function showStill() {
 // Whether a view of the group at the camera is sorted, or all are empty.
 const isSeen = () => state.doll.isOn || HEADER.groups[state.group].some((view) => state.sorted.views.includes(view) && HEADER.views[view].count) || isComplete();
 
-// Whether nothing moves yet: the Gaussians have not arrived, or an image covers them.
-export const isWaiting = () => !state.sorted || state.still !== null && state.still.began === null;
+// Whether nothing moves yet: the Gaussians have not arrived, or are not sorted, or an image covers them.
+export const isWaiting = () => {
+  const { sorted, still, doll } = state;
+  return !sorted || still !== null && still.began === null || !doll.isOn && sorted.part !== currentPart();
+};
 
 // How much of the picture the image covers, or the black in a headset.
 export const coverage = () => state.still ? state.still.left : 0;

@@ -1,7 +1,7 @@
 // Keys, pointers, the wheel, the device's motion, and buttons.
 
 import { MAX_FOV, MAX_PITCH, MIN_FOV, tangentOf, turn, walk } from "./camera.js";
-import { orbit, zoomDoll } from "./doll.js";
+import { orbit, resizeDoll, zoomDoll } from "./doll.js";
 import { byId, canvas, say, showMore } from "./dom.js";
 import { embed } from "./embed.js";
 import { enterAt, flyTo, goHome, setPose, setTouring, toggleDoll } from "./flight.js";
@@ -12,7 +12,9 @@ import { openList } from "./rings.js";
 import { copyLink, parsePose, savePicture } from "./share.js";
 import { camera, changed, state } from "./state.js";
 
+const DRAG = 5;  // pixels; a click moves by less
 const held = new Set(), fingers = new Map();
+let pressed;  // where the pointer went down; null when it has moved
 const MOVES = {
   KeyW: [0, 0, 1], ArrowUp: [0, 0, 1], KeyS: [0, 0, -1], ArrowDown: [0, 0, -1], KeyA: [-1, 0, 0], ArrowLeft: [-1, 0, 0],
   KeyD: [1, 0, 0], ArrowRight: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0],
@@ -70,6 +72,11 @@ function onMove(event) {
   const last = fingers.get(event.pointerId);
   if (!last) return;
   const moved = [event.clientX - last[0], event.clientY - last[1]];
+  if (pressed && distanceOf(pressed, [event.clientX, event.clientY]) >= DRAG) {
+    pressed = null;
+    canvas.setPointerCapture(event.pointerId);
+    canvas.focus({ preventScroll: true });  // not a ring
+  }
   const before = [...fingers.values()];
   fingers.set(event.pointerId, [event.clientX, event.clientY]);
   if (before.length === 1) {
@@ -84,6 +91,19 @@ function onMove(event) {
     setTouring(false);
     walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + apart - gap) * metres);
   }
+}
+
+function onWheel(event) {
+  if (!embed.isEngaged) {
+    say("Click the picture to change its field of view by the wheel");
+    return;
+  }
+  event.preventDefault();
+  const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
+  const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
+  if (state.doll.isOn) zoomDoll(factor);
+  else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
+  changed();
 }
 
 // Look around by the device's motion: its axes in the earth's (east, north, up), turned by the screen's angle.
@@ -144,39 +164,33 @@ export function listen() {
     held.clear();
     onHeld();
   });
-  addEventListener("resize", changed);
+  addEventListener("resize", () => {
+    if (state.doll.isOn) resizeDoll([innerWidth, innerHeight]);
+    changed();
+  });
   addEventListener("hashchange", () => {
     const pose = parsePose(location.hash);
     if (pose) setPose(pose);
   });
   addEventListener("pointerdown", (event) => { if (!byId("more").parentElement.contains(event.target)) showMore(false); });
-  let pressed = null;  // where the pointer went down, until it moves
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
-    pressed = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
-    fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    canvas.focus({ preventScroll: true });
-  });
-  canvas.addEventListener("pointermove", onMove);
+  for (const surface of [canvas, byId("spots")]) {  // rings are over the canvas
+    surface.addEventListener("pointerdown", (event) => {
+      if (surface === canvas) canvas.setPointerCapture(event.pointerId);
+      pressed = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      canvas.focus({ preventScroll: true });
+    });
+    surface.addEventListener("pointermove", onMove);
+    surface.addEventListener("wheel", onWheel, { passive: false });
+    surface.addEventListener("contextmenu", (event) => event.preventDefault());
+  }
+  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, (event) => fingers.delete(event.pointerId));
+  byId("spots").addEventListener("click", (event) => { if (event.detail && pressed === null) event.stopPropagation(); }, true);
   canvas.addEventListener("click", ({ clientX, clientY }) => {
-    if (!pressed || distanceOf(pressed, [clientX, clientY]) >= 5) return;
+    if (!pressed) return;
     if (measure.isOn) measure.take(clientX, clientY);
     else if (state.doll.isOn) enterAt(clientX, clientY);
   });
-  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("wheel", (event) => {
-    if (!embed.isEngaged) {
-      say("Click the picture to change its field of view by the wheel");
-      return;
-    }
-    event.preventDefault();
-    const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
-    const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
-    if (state.doll.isOn) zoomDoll(factor);
-    else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
-    changed();
-  }, { passive: false });
   byId("play").onclick = () => setTouring(!state.isTouring);
   byId("home").onclick = goHome;
   byId("place").onclick = openList;

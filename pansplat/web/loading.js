@@ -2,13 +2,18 @@
 // has all views; one with a folder loads those that the camera needs.
 
 import { nodeHere } from "./camera.js";
-import { byId, canvas } from "./dom.js";
-import { camera, currentPart, edges, isSortedFor, parts, refresh, state } from "./state.js";
+import { byId, canvas, say } from "./dom.js";
+import { camera, currentPart, edges, isComplete, isSortedFor, parts, refresh, state } from "./state.js";
+
+const SILENCE_MS = 10000;                  // of a server, after which a request has failed
+export const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a file that does not arrive, ms between them
+const GZIP = 0x8b1f;                       // its first two bytes
+const MISSING = "A part of the scene did not arrive. Load the page again; if that does not help, copy the whole folder.";
 
 export let failure = null;
 let worker = null, chunksArrived = 0;
 let queue = Promise.resolve();             // of files: the first view comes first
-let onMissing = fail;                      // reports a chunk that does not arrive
+let fails = fail;                          // reports an error of the data
 
 export function fail(error) {
   if (failure) return;
@@ -36,11 +41,38 @@ window.addPart = (view, isLast) => {
   receive(view, isLast, element.textContent);
 };
 
-// Of the folder beside the page.
-export async function fetchFile(name) {
-  const response = await fetch(`${HEADER.folder}/${name}`);
+// A file of the folder beside the page. A cache may hold what a server has answered in its place before.
+export async function fetchFile(name, isAgain) {
+  const stop = new AbortController(), chunks = [];
+  const hear = (promise) => {
+    const silence = setTimeout(() => stop.abort(), SILENCE_MS);
+    return promise.finally(() => clearTimeout(silence));
+  };
+  const response = await hear(fetch(`${HEADER.folder}/${name}`, { signal: stop.signal, cache: isAgain ? "reload" : "default" }));
   if (!response.ok) throw new Error(`${response.url} is missing`);
-  return response;
+  const reader = response.body.getReader(), type = response.headers.get("Content-Type") || "";
+  for (;;) {
+    const { done, value } = await hear(reader.read());
+    if (done) return new Blob(chunks, { type });
+    chunks.push(value);
+  }
+}
+
+// The next file waits for this one, but not for its later tries, which do not end. A page without any Gaussians fails.
+function loadView(view, tries = 1) {
+  queue = queue.then(async () => {
+    const blob = await fetchFile(...HEADER.views[view].files, tries > 1), chunk = await blob.arrayBuffer();
+    if (new Uint16Array(chunk.slice(0, 2))[0] !== GZIP) throw new Error("this is no gzip");  // but a page of the server
+    state.missing.delete(view);
+    receive(view, true, chunk);
+  }).catch(() => {
+    setTimeout(() => failure || loadView(view, tries + 1), tries * PAUSE_AFTER_ERROR);
+    if (tries !== TRIES) return;
+    state.missing.add(view);
+    canvas.ariaBusy = !isComplete();
+    if (isComplete() && !state.received.size) fails(new Error(MISSING));
+    else say(`A part of the scene at ${HEADER.spots[view].name} cannot be loaded yet`);
+  });
 }
 
 const countChunks = () => [...state.requested].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
@@ -56,10 +88,7 @@ export function loadAround() {
     if (state.requested.has(view) || !(isAll || near.has(view))) continue;
     state.requested.add(view);
     canvas.ariaBusy = true;
-    if (HEADER.folder === null) continue;
-    queue = queue.then(() => fetchFile(...HEADER.views[view].files)).then((response) => response.arrayBuffer()).then(
-      (chunk) => receive(view, true, chunk), () => onMissing(new Error("A part of the scene is missing. Copy the whole folder.")),
-    );
+    if (HEADER.folder !== null) loadView(view);
   }
 }
 
@@ -79,8 +108,7 @@ function onSorted(data) {
 // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
 export function load(onView) {
   return new Promise((resolve, reject) => {
-    const fails = (error) => state.sorted ? fail(error) : reject(error);
-    onMissing = fails;
+    fails = (error) => state.sorted ? fail(error) : reject(error);
     worker = new Worker(URL.createObjectURL(new Blob([WORKER])));
     worker.onmessage = ({ data }) => {
       if (data.error) fails(new Error(`The data of the scene cannot be read: ${data.error}`));
@@ -99,7 +127,7 @@ export function load(onView) {
     if (HEADER.folder !== null) return;
     loadAround();
     addEventListener("DOMContentLoaded", () => {
-      if (chunksArrived !== countChunks()) fails(new Error("A part of the scene is missing. Copy the whole folder."));
+      if (chunksArrived !== countChunks()) fails(new Error(MISSING));
     });
   });
 }

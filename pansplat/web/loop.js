@@ -37,9 +37,9 @@ export function advance(now, seconds) {
   advanceRoute(seconds);
   advanceDollFlight(now);
   if (edges.length && !state.doll.isOn) updateEdge(now);
-  updateStill(now);
   showViews(1000 * seconds / FADE_MS);
   photographs.update(seconds);
+  updateStill(now);
   loadAround();
   const node = nodeHere(), isMoving = state.flight !== null || state.doll.flight !== null || isWaiting();
   const isThere = !isMoving && !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;

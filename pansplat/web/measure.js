@@ -1,4 +1,5 @@
-// Distances in the picture: the depth at one point, and the distance of two.
+// Distances in the picture: the depth at one point, and the distance of two, in the unit of the poses. All other lengths of
+// a page are in about metres, whatever that unit is.
 
 import { byId, say } from "./dom.js";
 import { distanceOf, minus, plus, scaled } from "./graph.js";

@@ -4,7 +4,7 @@
 import { cameraFor, settleAt, showViews, tallOf } from "./camera.js";
 import { byId, canvas } from "./dom.js";
 import { embed } from "./embed.js";
-import { flyTo, jumpTo, setPose, setTouring } from "./flight.js";
+import { flyTo, jumpTo, PHOTO_WAIT_MS, setPose, setTouring } from "./flight.js";
 import { listen } from "./input.js";
 import { fail, failure, load, loadAround } from "./loading.js";
 import { isSettled, onFrame } from "./loop.js";
@@ -70,9 +70,11 @@ async function main() {
     if (failure) throw failure;
     await wait(50);
   }
-  let isLoaded = false;
+  let isLoaded = false, isLate = false;
   loading.then(() => { isLoaded = true; }, () => { isLoaded = true; });
-  while (!isLoaded && photographs.isExpected) {  // it can be looked at before the Gaussians arrive
+  wait(PHOTO_WAIT_MS).then(() => { isLate = true; });
+  while (!isLoaded && !photographs.isOpaque) {  // it can be looked at before the Gaussians arrive
+    if (isLate || !photographs.isExpected) loadAround();
     photographs.update(1);
     await wait(5);
   }
@@ -85,7 +87,7 @@ async function main() {
   makeRings();
   makeList();
   makeNotes();
-  embed.listen(canvas, window.pansplat);
+  embed.listen([canvas, byId("spots")], window.pansplat);
   onFrame(performance.now());
   byId("cover").className = "done";
   setTimeout(() => { byId("cover").hidden = !failure; }, 700);

@@ -4,7 +4,7 @@
 import { nodeHere, rotationOf, tangentOf } from "./camera.js";
 import { fullSize, say } from "./dom.js";
 import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
-import { fetchFile } from "./loading.js";
+import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
 const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
@@ -13,7 +13,6 @@ const PHOTO_FADE = 0.2;             // seconds
 const DENSITY = 1.3;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
 const AT_ONCE = 6;                  // tiles that are read at the same time
-const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a tile that does not arrive, ms between them
 const SMALL_FACE = 2048;            // largest face on a phone, texels
 // Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
 const FACES = [
@@ -31,10 +30,10 @@ window.addTile = (name, number) => {
   script.remove();
 };
 
-async function readTile(key) {
+async function readTile({ key, tries }) {
   if (HEADER.folder !== null) {
     try {
-      return await createImageBitmap(await (await fetchFile(`${key}.jpg`)).blob());
+      return await createImageBitmap(await fetchFile(`${key}.jpg`, tries > 0));
     } catch {
       throw new Error(`${key}.jpg is missing, or is no tile`);  // a web server may answer with a page
     }
@@ -121,7 +120,7 @@ class Photographs {
   // The panorama at which the camera stands.
   findNode() {
     const node = nodeHere();
-    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS * HEADER.unit ? node : null;
+    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS ? node : null;
   }
 
   // Whether the photograph at the camera, which is not shown yet, may arrive soon.
@@ -177,13 +176,13 @@ class Photographs {
     this.read(this.wanted, size);
     const isShown = isStill && node !== null && !state.headset.session && this.levelsOf(node)[0].isReady;
     if (this.node !== null && node !== this.node) {
-      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / (GONE * HEADER.unit);
+      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / GONE;
       this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
     }
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
-    const step = seconds / PHOTO_FADE;
+    const step = state.still?.began === null ? 1 : seconds / PHOTO_FADE;  // the still covers it
     this.opacity = clamp(this.target, this.opacity - step, this.opacity + step);
     changed();
   }
@@ -201,7 +200,7 @@ class Photographs {
       tile.status = "reading";
       this.reading += 1;
       try {
-        const image = await readTile(tile.key);
+        const image = await readTile(tile);
         if (this.made.get(node) === levels && this.renderer === state.renderer) {
           level.take(tile, image);
           tile.status = "ready";

@@ -43,7 +43,7 @@ class Plan {
 
   // To the right and forward in metres.
   turned([right, forward]) {
-    const [c, s] = [Math.cos(this.turn), Math.sin(this.turn)].map((value) => value / HEADER.unit);
+    const [c, s] = [Math.cos(this.turn), Math.sin(this.turn)];
     return [c * right - s * forward, s * right + c * forward];
   }
 
@@ -84,7 +84,7 @@ class Plan {
       svg[drawnOf(node) ? "prepend" : "append"](group);  // what is sure is on top
       if ([node, ...others].every((each) => named.has(each))) return;  // of a room whose outline is beside it
       [node, ...others].forEach((each) => named.add(each));
-      write(node, [x, y], name, scale * width / HEADER.unit);
+      write(node, [x, y], name, scale * width);
     });
     this.camera = drawSvg("path", { d: "M0 0L-9 -22L9 -22Z" });
     svg.append(this.camera);
@@ -130,7 +130,7 @@ class Plan {
 
   show() {
     if (!this.isOpen) return;
-    const world = this.chooseWorld(), heightOf = (position) => dot(column(HEADER.level, 1), position) / HEADER.unit;
+    const world = this.chooseWorld(), heightOf = (position) => dot(column(HEADER.level, 1), position);
     if (world !== this.world) this.make(world);
     const [x, y] = this.toPlan(this.turned(draw(state.here, flat(camera.position)))), turn = drawnOf(state.here)?.[3] ?? 0;
     this.camera.setAttribute("visibility", worldOf(state.here) === world ? "visible" : "hidden");

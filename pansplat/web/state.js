@@ -17,6 +17,7 @@ export const shown = HEADER.views.map(() => 0);
 export const state = {
   edge: 0, group: edges.length ? edges[0][2] : 0, fade: null,  // at the camera; `fade`: from the views of another group
   requested: new Set(), received: new Set(),                   // views whose data is loaded, and is there
+  missing: new Set(),                                          // those that do not arrive; they are still tried
   sorted: null, isSorting: false,                              // the last order of the worker (sorter.js)
   renderer: null,                                              // null while the graphics are lost
   isDirty: true, drawnScale: 0, lastChange: 0,                 // of the picture
@@ -45,7 +46,7 @@ export function redraw() {
 
 export const currentPart = () => edges.length ? partOfEdge(GRAPH, state.edge) : 0;
 export const endsOfEdge = () => edges.length ? edges[state.edge].slice(0, 2) : [];
-export const isComplete = () => [...state.requested].every((view) => state.received.has(view));
+export const isComplete = () => [...state.requested].every((view) => state.received.has(view) || state.missing.has(view));
 
 // Whether the order is that of a camera; the doll's house needs none.
 export const isSortedFor = (position, part, tolerance = 0) => {

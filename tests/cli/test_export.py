@@ -117,11 +117,11 @@ def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
     assert "index.html" in refusal(*command, out), "a page of another program stays"
 
 
-@pytest.mark.parametrize(("stated", "title"), [({"title": "Our <home>"}, "Our &lt;home&gt;"), ({}, "my home")])
+@pytest.mark.parametrize(("stated", "title"), [({"title": "Our <home>"}, "Our &lt;home&gt;"), ({}, "Villa St. Moritz")])
 def test_the_page_of_a_web_tour_has_its_title_or_the_name_of_its_folder(
     stated: dict[str, str], title: str, tmp_path: Path, write_tour: Callable[..., Path]
 ) -> None:
-    (image,) = list(write_tour(tmp_path / "my_home", height=64).glob("*0.png"))[:1]
+    (image,) = list(write_tour(tmp_path / "Villa_St._Moritz", height=64).glob("*0.png"))[:1]
     note = {"type": "info", "text": "a lamp"}
     tour, out = image.parent / "tour.json", tmp_path / "out.html"
     tour.write_text(json.dumps({**stated, "scenes": {"hall": {"panorama": image.name, "hotSpots": [note]}}}))

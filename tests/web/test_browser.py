@@ -17,7 +17,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -34,6 +34,7 @@ from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import path_poses
+from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.notebook import _bundle_scene
@@ -144,6 +145,39 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
         yield Sites(folder, *origins)
 
 
+class FaultyHandler(QuietHandler):
+    """Drops, delays and replaces files by their names, as often as `faults` has it."""
+
+    faults: ClassVar[dict[str, list[str]]] = {}
+
+    def do_GET(self) -> None:
+        waiting = self.faults.get(self.path.rsplit("/")[-1], [])
+        fault = waiting.pop(0) if waiting else None
+        if fault == "html":
+            self.path = "/host.html"
+        elif fault == "half":
+            content = Path(self.translate_path(self.path)).read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content[: len(content) // 2])
+            self.wfile.flush()
+        if fault in ("half", "silence"):
+            time.sleep(2 * LIMIT)
+        elif fault != "drop":
+            super().do_GET()
+
+
+@pytest.fixture
+def faulty(folder: Path) -> Iterator[str]:
+    """Origin of a FaultyHandler that shows the folder."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(FaultyHandler, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        FaultyHandler.faults.clear()
+        server.shutdown()
+
+
 @pytest.fixture(scope="module")
 def photographs(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> list[Pair]:
     """Of the scene, 1024 rows; the second one has a note ahead on the right, the third one another."""
@@ -203,7 +237,8 @@ class OpenPage:
 
     def load(self, address: str) -> None:
         self.page.goto(address)
-        assert self.page.evaluate("pansplat.ready.then(() => 'ready', String)") == "ready"
+        late = f"new Promise((resolve) => setTimeout(resolve, {1000 * LIMIT}, 'late'))"
+        assert self.page.evaluate(f"Promise.race([pansplat.ready.then(() => 'ready', String), {late}])") == "ready"
 
     def run(self, program: str, *arguments: Any) -> Any:
         return self.page.evaluate(program, *arguments)
@@ -412,6 +447,90 @@ def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_bac
         page.page.keyboard.press("KeyO")
         assert "fewer than half" in page.page.inner_text("#status") and page.camera["fov"] != 45
         assert page.messages == []
+
+
+def test_a_pose_and_a_tour_lead_out_of_the_dolls_house(chromium: Any, room_page: Path) -> None:
+    with opened(chromium, room_page, is_stepped=True) as page:
+        start = page.camera
+        outside = "pansplat.camera.fov === 45 && pansplat.isSettled()"
+        page.page.keyboard.press("KeyO")
+        page.wait(outside)
+        page.run("resized = false, addEventListener('resize', () => { resized = true; })")
+        page.page.set_viewport_size({"width": SIZE[1], "height": SIZE[0]})
+        page.wait(f"resized && {outside}")
+        image = decode(page.run("([width, height]) => pansplat.render(width, height)", list(SIZE[::-1])))
+        assert np.abs(image[:, [0, -1]] - image[0, 0]).max() < 0.01, (
+            "the whole house is in the picture of a turned phone"
+        )
+        page.run("pansplat.setPose({ yaw: 20 })")
+        turned = page.camera
+        assert (turned["position"], turned["fov"], turned["pitch"]) == (start["position"], start["fov"], start["pitch"])
+        page.page.keyboard.press("KeyO")
+        page.wait(outside)
+        page.page.keyboard.press("Space")
+        assert page.page.get_attribute("#play", "aria-pressed") == "true"
+        assert page.page.get_attribute("#doll", "aria-pressed") == "false" and page.camera["fov"] == start["fov"]
+        page.wait(f"pansplat.camera.position.some((x, i) => Math.abs(x - {start['position']}[i]) > 0.1)")
+        assert page.messages == []
+
+
+def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_chooses(
+    chromium: Any, folder: Path
+) -> None:
+    with opened(chromium, folder / "tour.html", size=(640, 480), reduced_motion="reduce") as page:
+        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
+        right, down, forward = in_level(page, np.subtract(mark, position))
+        pose = {"position": position, "yaw": math.degrees(math.atan2(right, forward))}
+        pose["pitch"] = -math.degrees(math.atan2(down, math.hypot(right, forward)))
+        for part in ("", " span"):
+            page.run("(pose) => pansplat.setPose(pose)", pose)
+            page.settle()
+            ring = page.page.locator(f"#spots button:not([hidden])[title='Go to room 1']{part}").bounding_box()
+            place = ring["x"] + ring["width"] / 2, ring["y"] + ring["height"] / 2
+            before, mouse = page.camera, page.page.mouse
+            for end in ((place[0] + 60, place[1]), place):  # with, and back to where it began
+                mouse.move(*place)
+                mouse.down()
+                mouse.move(place[0] + 30, place[1] + 20)
+                mouse.move(*end)
+                mouse.up()
+                page.settle()
+                assert page.camera["position"] == position, "no click"
+                assert (page.camera["yaw"] < before["yaw"] - 0.05) == (end != place)
+                page.run("(pose) => pansplat.setPose(pose)", pose)
+                page.settle()
+            mouse.wheel(0, -200)
+            page.wait(f"pansplat.camera.fov < {before['fov']}")
+            page.run("(fov) => pansplat.setPose({ fov })", before["fov"])
+            page.settle()
+            mouse.click(*place)
+            page.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[1].position[i])")
+
+
+def test_a_page_of_small_and_large_units_is_that_of_metres(
+    chromium: Any, folder: Path, scene: Scene, photographs: list[Pair], tmp_path: Path
+) -> None:
+    """The third panorama is moved to another storey."""
+    seen, plans = [], []
+    for unit in (1.0, 1e3, 1e-3):
+        path = tmp_path / f"{unit:g}.html"
+        framed = dataclasses.replace(scene, frame=WorldFrame(unit))
+        write_page(framed, path, photographs=photographs, photo_height=256)
+        with opened(chromium, path, size=(640, 480)) as page:
+            position = page.run("HEADER.spots[0].position")
+            for offset in (0.02, 0.1):
+                pose = {"position": [position[0] + offset, *position[1:]], "yaw": 0, "pitch": 0}
+                page.run("(pose) => pansplat.setPose(pose)", pose)
+                page.settle()
+                seen.append(page.draw())
+            page.run("HEADER.spots[2].position[1] -= 3, 0")
+            page.page.keyboard.press("KeyM")
+            page.settle()
+            plans.append(page.run("document.getElementById('drawing').innerHTML"))
+    assert psnr(seen[0], seen[1]) < 25, "a photograph, and Gaussians"
+    assert "faint" in plans[0] and plans[0] == plans[1] == plans[2]
+    assert min(psnr(seen[k], seen[k % 2]) for k in range(2, 6)) > 45
 
 
 def test_flights_jumps_and_keys_end_alike_and_face_no_wall(chromium: Any, folder: Path) -> None:
@@ -931,10 +1050,86 @@ def read_failure(chromium: Any, path: Path | str) -> str:
     return message
 
 
+FAST = """(({ setTimeout }) => {  // silence and pauses between tries are short
+    const shorten = (ms) => ms > 1000 && ms <= 10000 && ms !== 5000 ? ms / 10 : ms;
+    window.setTimeout = (act, ms, ...values) => setTimeout(act, shorten(ms), ...values);
+})(window);"""
+FAULTS = ("drop", "silence", "half", "html")
+
+
+def list_files(path: Path) -> tuple[list[str], list[str]]:
+    """The .bin of each view and the first tile of each photograph of a page."""
+    (header,) = re.findall(r"^const HEADER = (.*);$", path.read_text(), flags=re.MULTILINE)
+    header = json.loads(header)
+    files = [view["files"][0] for view in header["views"]]
+    return files, [f"{photograph['name']}_0.jpg" for photograph in header["photographs"]]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_file_that_does_not_arrive_is_read_again(chromium: Any, folder: Path, faulty: str, fault: str) -> None:
+    files, tiles = list_files(folder / "poor" / "index.html")
+    FaultyHandler.faults |= {name: [fault, fault] for name in (files[0], files[2], tiles[0], tiles[2])}
+    with opened(chromium, f"{faulty}/poor/index.html", script=FAST) as page:
+        page.settle()
+        page.run("pansplat.goTo(3, { jump: true }), 0")
+        page.wait("document.getElementById('name').innerText === 'room 2' && pansplat.isSettled()")
+        assert not any(FaultyHandler.faults.values()) and page.page.inner_text("#status") == ""
+        page.run("pansplat.setPose({ position: HEADER.spots[2].position.map((x) => x + 0.1) })")
+        page.settle()
+        assert page.draw().std() > 0.05 and page.page.is_hidden("#cover")
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_part_that_does_not_arrive_ends_no_page_and_is_shown_when_it_does(
+    chromium: Any, folder: Path, faulty: str, fault: str
+) -> None:
+    files, _ = list_files(folder / "hosted.html")
+    FaultyHandler.faults[files[2]] = [fault] * 4
+    with opened(chromium, f"{faulty}/hosted.html", script=FAST) as page:
+        page.run("groups = HEADER.groups[1], HEADER.groups[1] = [2], 0")  # nothing else is seen there
+        page.run("pansplat.goTo(3, { jump: true }), 0")
+        page.wait(
+            "document.getElementById('status').innerText === 'A part of the scene at room 2 cannot be loaded yet'"
+        )
+        page.wait("document.getElementById('still').hidden")
+        assert page.page.is_hidden("#cover") and page.draw().std() < 0.01
+        page.wait(f"performance.getEntriesByName(new URL('hosted_files/{files[2]}', location)).length > 4")
+        page.settle()
+        assert page.draw().std() > 0.05
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_tile_that_does_not_arrive_does_not_delay_the_gaussians(
+    chromium: Any, folder: Path, faulty: str, fault: str
+) -> None:
+    _, tiles = list_files(folder / "photos" / "index.html")
+    FaultyHandler.faults |= {tile: [fault] * 9 for tile in tiles}
+    endless = STAY.replace("5000", "10000")  # silence
+    with opened(chromium, f"{faulty}/photos/index.html", script=endless) as page:
+        page.wait("document.getElementById('view').ariaBusy === 'false'")
+        page.run("pansplat.setPose({ position: HEADER.spots[2].position.map((x) => x + 0.1) })")
+        page.settle()
+        assert page.draw().std() > 0.05
+
+
+def test_a_fade_ends_though_the_camera_walks_away_before_the_gaussians_arrive(chromium: Any, folder: Path) -> None:
+    late = HOLD + "isHolding = ({ chunk, view }) => chunk && view === 2;"
+    with opened(chromium, folder / "house.html", script=late, is_stepped=True) as page:
+        page.run("pansplat.goTo(3, { jump: true }), HEADER.groups[1] = [2], 0")
+        page.page.keyboard.down("KeyS")
+        away = "Math.hypot(...pansplat.camera.position.map((x, i) => x - HEADER.spots[2].position[i]))"
+        page.wait(f"{away} > 1.1 * HEADER.speed")
+        page.page.keyboard.up("KeyS")
+        assert page.page.is_visible("#still")
+        page.run("release()")
+        page.settle()
+        assert page.page.is_hidden("#still")
+
+
 def test_missing_parts_are_named(chromium: Any, folder: Path) -> None:
     (folder / "alone").mkdir()
     shutil.copy(folder / "split.html", folder / "alone")
-    assert "Copy the whole folder" in read_failure(chromium, folder / "alone" / "split.html")
+    assert "copy the whole folder" in read_failure(chromium, folder / "alone" / "split.html")
 
 
 def test_a_folder_that_is_opened_from_disk_says_what_to_do(chromium: Any, folder: Path) -> None:
@@ -1102,6 +1297,33 @@ def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panor
         page.run("pansplat.goTo(2).then(() => pansplat.setPose({ yaw: pansplat.getPose().yaw + 90 }))")
         assert page.run("pansplat.goTo(1)") and max(page.run("scales")) < 1.05, "it grows on the way ahead only"
         assert page.messages == []
+
+
+def test_a_fade_begins_with_the_picture_at_rest(chromium: Any, folder: Path) -> None:
+    """The resolution has fallen in motion."""
+    width = "document.getElementById('view').width"
+    with opened(chromium, folder / "house.html", is_stepped=True) as page:
+        page.settle()
+        page.run("HEADER.poor.push([0, 1]), HEADER.spots.forEach((spot) => { spot.turned = 0; })")
+        for yaw in range(8):
+            page.run(f"pansplat.setPose({{ yaw: {yaw} }}), step(90)")
+        assert page.run(width) < 0.6 * SIZE[0]
+        page.settle()
+        seen = page.draw()
+        page.settle()
+        page.run(f"pansplat.goTo(2), step({FRAME_MS})")
+        assert page.page.is_visible("#still"), "no other picture before"
+        assert psnr(decode(page.run("document.getElementById('still').toDataURL()")), seen) > 45
+
+
+def test_a_fade_to_a_photograph_does_not_wait_for_the_order_of_the_gaussians(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "poor" / "index.html", script=HOLD, is_stepped=True) as page:
+        page.settle()
+        page.run("isHolding = ({ position }) => position, pansplat.goTo(2), 0")
+        page.wait("Number(document.getElementById('still').style.opacity) < 0.5", 10)
+        page.run("release()")
+        page.settle()
+        assert page.page.is_hidden("#still")
 
 
 @pytest.mark.slow

@@ -6,8 +6,10 @@ import json
 import math
 import os
 import re
+import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.pairs import Pair
 from pansplat.refinement.budget import merge_to
+from pansplat.system.atomic import replacing
 from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_camera_height
@@ -371,6 +374,40 @@ def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(
     files = {file for file in tmp_path.rglob("*") if file.is_file()}
     assert files == {tmp_path / "tour.html", *([other] if is_shared else [])}
     assert (tmp_path / "tour_files").exists() == is_shared
+
+
+@pytest.mark.parametrize("at", ["first part", "last part"])
+def test_an_export_that_ends_during_another_one_removes_none_of_its_parts(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    path, counts = tmp_path / "tour.html", []
+    write_page(scene, path, split=True)
+
+    @contextmanager
+    def interrupted(file: Path) -> Iterator[Path]:
+        with replacing(file) as temporary:
+            yield temporary
+        counts.append(file.suffix)
+        if file.suffix == ".bin" and counts.count(".bin") == (1 if at == "first part" else 3):
+            monkeypatch.setattr(page_module, "replacing", replacing)
+            write_page(scene, path, split=True, gaussians=900)
+
+    monkeypatch.setattr(page_module, "replacing", interrupted)
+    for gaussians in (1500, page_module.DEFAULT_GAUSSIANS):  # other parts than before, and the same
+        counts.clear()
+        last = write_page(scene, path, split=True, gaussians=gaussians)
+        assert set((tmp_path / "tour_files").iterdir()) == set(last.files[1:])
+        monkeypatch.setattr(page_module, "replacing", interrupted)
+
+
+def test_the_parts_of_a_copy_of_a_page_stay(scene: Scene, tmp_path: Path) -> None:
+    first = write_page(scene, tmp_path / "tour.html", split=True)
+    shutil.copy(first.files[0], tmp_path / "copy.html")
+    second = write_page(scene, tmp_path / "tour.html", split=True, gaussians=900)
+    assert set((tmp_path / "tour_files").iterdir()) == {*first.files[1:], *second.files[1:]}
+    (tmp_path / "copy.html").unlink()
+    write_page(scene, tmp_path / "tour.html")
+    assert list(tmp_path.iterdir()) == [tmp_path / "tour.html"]
 
 
 @pytest.mark.parametrize("stem", ["room #2", "50%25 done?", "a:b & 'c'", "k\xfcche", os.fsdecode(b"caf\xe9")])
