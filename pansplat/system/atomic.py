@@ -25,10 +25,13 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
     stays unchanged.
 
     Args:
-        path: the file to write.
+        path: the file to write. A symbolic link to a file stays, and that file is replaced; one to nothing is replaced,
+            as whoever made a folder chose where it leads.
         failures: further exceptions of a library that mean a failed write, such as a full disk.
     """
     path = Path(path)
+    if path.is_symlink() and path.exists():
+        path = Path(os.path.realpath(path))
     if not path.parent.is_dir():
         raise InputError(f"cannot write {path}: needed an existing folder, got {path.parent}; create it first")
     if path.is_dir():

@@ -141,6 +141,8 @@ def write_cache_file(folders: Sequence[Path], name: str, content: bytes) -> Path
     for folder in folders:
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            if (folder / name).is_symlink():  # made by whoever made the folder
+                (folder / name).unlink()
             with replacing(folder / name) as unfinished:
                 unfinished.write_bytes(content)
         except (OSError, InputError):
