@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -73,6 +74,20 @@ class Note:
     addresses: tuple[str, ...] = ()
 
 
+class LinksEntry(NamedTuple):
+    """Where links.json states links and notes of a panorama.
+
+    Attributes:
+        file: the links.json, which need not exist.
+        keys: that stand for the panorama; the first one that the file has counts, else the first one.
+        notes: where the file states none.
+    """
+
+    file: Path
+    keys: tuple[str, ...]
+    notes: tuple[Note, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Panorama:
     """One panorama file with its pose.
@@ -94,7 +109,7 @@ class Panorama:
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
         frame: where the world of the pose is in the user's world, that of files.
-        links_at: the links.json that links and notes are read from, and the key there; None if none is read.
+        links_at: where links and notes are read from; None if no links.json is read.
     """
 
     name: str
@@ -112,7 +127,7 @@ class Panorama:
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
     frame: WorldFrame = USER_FRAME
-    links_at: tuple[Path, str] | None = None
+    links_at: LinksEntry | None = None
 
     def __repr__(self) -> str:
         position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())

@@ -1,5 +1,6 @@
 """State and input of the whole viewer, without OpenGL and without a window: nothing is drawn."""
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -614,6 +615,36 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app.state.camera = replace(app.state.camera, position=(0.0, 0.0, 0.4))
     app.viewer.put_note("between")
     assert file.read_bytes() == written and "at a panorama" in app.state.message
+    file.unlink()
+
+
+def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
+    """Notes of before, of another window or by hand stay, also where poses were found since, or the key is another."""
+    app, file = make_app(), house.folder / "links.json"
+    keys = ("room0.png", "room0")
+    first, *others = (replace(p, links_at=p.links_at._replace(keys=keys)) for p in house.panoramas)
+    entries = [SceneEntry("house", tour=replace(house, panoramas=(first, *others))), SceneEntry("other")]
+    posed = replace(house, panoramas=(replace(first), *others))  # as it was loaded, before any note
+    app.show(*entries)
+    app.viewer.put_note("one")
+    app.scenes.choose(1)
+    app.settle()
+    for shown in (entries[0], SceneEntry("house", tour=posed)):
+        app.show(shown)
+        index = app.viewer.stage.photographs.find_stop(np.asarray(app.state.camera.position))
+        assert app.viewer.stage.photographs.list_notes(index)[0].text == "one"
+        content = json.loads(file.read_text())
+        (entry,) = content.values()
+        entry["notes"].append({"yaw": 2.0 + len(entry["notes"]), "pitch": 0, "text": "by hand", "colour": "red"})
+        file.write_text(json.dumps({"room0": entry, "of the user": 1}))
+        app.state.camera = replace(app.state.camera, yaw_radians=app.state.camera.yaw_radians + 1)
+        app.viewer.put_note("more")
+        content = json.loads(file.read_text())
+        assert content.keys() == {"room0", "of the user"} and entry["notes"] == content.pop("room0")["notes"][:-1]
+        file.write_text(json.dumps({"room0": entry}))
+    file.unlink()
+    app.viewer.put_note("last")
+    assert [note["text"] for note in json.loads(file.read_text())["room0.png"]["notes"]] == ["last"]
     file.unlink()
 
 
