@@ -28,7 +28,7 @@ from tyro.conf import Positional, arg
 from pansplat.cli.export import Export, Page
 from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction
 from pansplat.errors import InputError, collect_notes
-from pansplat.prediction_options import PredictOptions, ReadOptions
+from pansplat.prediction_options import PredictOptions, ReadOptions, choose_caches
 from pansplat.system.console import is_out_of_memory, print_message, progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.devices import with_device
@@ -193,7 +193,8 @@ def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict
     """
     began, files, num_made, error = time.perf_counter(), list[Path](), 0, None
     folder = batch.out / item[0]
-    with collect_notes() as notes, contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    silent = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
+    with collect_notes() as notes, silent[0], silent[1], choose_caches(batch):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(folder)

@@ -206,7 +206,9 @@ def _measure_depths(start: int, edges: Collection[tuple[int, int]]) -> dict[int,
     return depth
 
 
-def judge(names: Sequence[str], ties: Iterable[Tie], by_hand: Collection[str], source: Path) -> dict[str, Placement]:
+def judge(
+    names: Sequence[str], ties: Iterable[Tie], by_hand: Collection[str], source: Path | None
+) -> dict[str, Placement]:
     """The placements of the panoramas of one group; see `find_holds`."""
     if len(names) == 1:
         return {names[0]: Placement("not placed", "no other panorama has a pose with it", source)}
