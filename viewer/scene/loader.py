@@ -6,12 +6,13 @@ are parts of the scene in the file. Imports no torch before it loads.
 """
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pansplat.errors import InputError, collect_notes
+from pansplat.errors import InputError, InputWarning, NothingFoundError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
 from pansplat.system.progress import CONNECTED, report_progress, stage
@@ -102,19 +103,18 @@ def find_entries(
     if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if is_scene_file(p)) if path.is_dir() else []
-    try:
-        from pansplat.pipeline import load_pairs
-
-        with collect_notes() as notes:
-            on_unposed = None if show is None else lambda pairs: show(_list_tours(pairs))
-            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
-    except InputError:
-        if not scenes:
-            raise
-        pairs, notes = [], []
-    from pansplat.pipeline import load_predictor, warn_of_single_views
+    from pansplat.pipeline import load_pairs, load_predictor, warn_of_single_views
     from pansplat.tours.graph import find_tours
 
+    on_unposed, pairs = None if show is None else lambda pairs: show(_list_tours(pairs)), []
+    with collect_notes() as notes:
+        try:
+            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
+        except InputError as error:
+            if not scenes:
+                raise
+            if not isinstance(error, NothingFoundError):
+                warnings.warn(f"the photographs are left out: {error}", InputWarning, stacklevel=2)
     tours = find_tours(pairs)
     if any(a == b for tour in tours for a, b in tour.overlaps):
         predictor = load_predictor(prediction)
@@ -124,7 +124,7 @@ def find_entries(
         notes += replaced
     entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
-    return entries + [SceneEntry(p.stem, file=p) for p in scenes]
+    return entries + [SceneEntry(p.stem, file=p, notes=tuple(notes)) for p in scenes]
 
 
 def _list_tours(pairs: "list[Pair]") -> list[SceneEntry]:

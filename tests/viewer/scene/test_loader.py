@@ -55,6 +55,11 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
     assert [entry.name for entry in entries] == ["a", "b"]
     loaded = load_entry(entries[0], PredictOptions())
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
+    assert [entry.notes for entry in entries] == [(), ()]
+    (tmp_path / "hall.jpg").write_bytes(b"half a photograph")
+    with pytest.warns(InputWarning, match=r"the photographs are left out: .*hall\.jpg"):
+        entries = find_entries(tmp_path, ReadOptions(), PredictOptions())
+    assert [entry.name for entry in entries] == ["a", "b"] and all("hall.jpg" in entry.notes[0] for entry in entries)
 
 
 def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
