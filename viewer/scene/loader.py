@@ -145,7 +145,7 @@ def choose_entry(entries: Sequence[SceneEntry], name: str | None) -> int:
 
 
 def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
-    """The photographs of a folder among all entries, in the worlds of its files, by name."""
+    """The photographs of a folder among all entries, in the worlds and the unit of its files, by name."""
     from pansplat.geometry.world import USER_FRAME
 
     found: dict[Path, Panorama] = {}
@@ -155,7 +155,11 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
             found |= {view.image: view for view in tour.originals or tour.panoramas}
         elif pair is not None and pair.folder == folder:
             found |= {view.image: view for view in pair.context + pair.targets}
-    return sorted((view.in_frame(USER_FRAME) for view in found.values()), key=lambda view: view.name)
+    views = (
+        replace(view.in_frame(USER_FRAME), camera_height=view.frame.unit * view.camera_height)
+        for view in found.values()
+    )
+    return sorted(views, key=lambda view: view.name)
 
 
 def load_entry(
