@@ -16,6 +16,7 @@ import pytest
 import torch
 from imgui_bundle import imgui
 
+from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.path import find_direction
@@ -646,6 +647,30 @@ def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
     app.viewer.put_note("last")
     assert [note["text"] for note in json.loads(file.read_text())["room0.png"]["notes"]] == ["last"]
     file.unlink()
+
+
+def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_predictor, monkeypatch, house):
+    """In the scene of a single photograph, and of two, also if it flew before the scene was there."""
+    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    options = PredictOptions("sphere", height=64, refine_seconds=0.0, cache=False)
+    for views, farthest in (((0,), 1.8), ((0, 1), 2.6)):
+        app = make_app()
+        gate = Gate(lambda entry: load_entry(entry, options), "waiting", 0.0)
+        app.load = gate
+        app.scenes.show([SceneEntry("room", pair=house.make_pair(views))], 0)
+        for _ in range(20):
+            app.frame(0.2, held=frozenset("w"))
+        gate.open()
+        app.settle()
+        assert app.state.has_stopped and 1.7 < np.linalg.norm(app.state.camera.position) < farthest
+        assert "no photograph shows what is behind" in app.state.message
+        app.state.message = ""
+        for _ in range(20):
+            app.frame(0.2, held=frozenset("w"))
+        assert 1.7 < np.linalg.norm(app.state.camera.position) < farthest and not app.state.message
+        for _ in range(10):
+            app.frame(0.2, held=frozenset("s"))
+        assert np.linalg.norm(app.state.camera.position) < 0.6
 
 
 # --- tours ---

@@ -78,7 +78,7 @@ class LoadedScene:
 
     Attributes:
         is_final: False for a prediction whose refinement will follow.
-        facts: of a scene of a tour.
+        facts: of a scene with cameras.
     """
 
     entry: SceneEntry
@@ -184,7 +184,7 @@ def load_entry(
         assert entry.file is not None
         scene = pipeline.load(entry.file)
         if not scene.overlaps or scene.joint:  # the views of an edge alone lack surfaces of others
-            return LoadedScene(entry, scene)
+            return _with_facts(entry, scene)
         from pansplat.tours.graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
@@ -192,9 +192,18 @@ def load_entry(
     scene = pipeline.predict(
         entry.pair,
         options=prediction,
-        on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
+        on_predicted=None if show is None else lambda scene: show(_with_facts(entry, scene, is_final=False)),
     )
-    return LoadedScene(entry, scene)
+    return _with_facts(entry, scene)
+
+
+def _with_facts(entry: SceneEntry, scene: "Scene", is_final: bool = True) -> LoadedScene:
+    """A scene without a graph, and where surfaces stop its camera."""
+    from pansplat.tours.facts import TourFacts
+
+    facts = TourFacts(scene) if len(scene.cam2world) else None
+    _ = facts and facts.bounds  # computed in this thread
+    return LoadedScene(entry, scene, is_final, facts)
 
 
 def _load_tour_scene(
