@@ -84,11 +84,10 @@ _OF_REFINEMENT = "refine_seconds", "gaussians", "joint"
 
 def choose_caches(command: Any) -> AbstractContextManager[None]:
     """A block without caches if options of a prediction, alone or among those of a command, have `--no-cache`."""
-    nested, is_without = [command], False
-    while nested and not is_without:
-        is_without = not getattr(nested[-1], "cache", True)
-        nested += filter(dataclasses.is_dataclass, vars(nested.pop()).values())
-    if not is_without:
+    nested = [command]
+    for each in nested:
+        nested += filter(dataclasses.is_dataclass, vars(each).values())
+    if all(getattr(each, "cache", True) for each in nested):
         return nullcontext()
     from pansplat.system.store import without_caches
 

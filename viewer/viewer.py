@@ -278,8 +278,7 @@ class Viewer:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
         photographs, camera = self.stage.photographs, self.state.camera
         index = photographs.find_stop(np.asarray(camera.position))
-        panorama = None if index is None else photographs.panoramas[index]
-        if index is None or panorama is None or panorama.links_at is None:
+        if index is None or (panorama := photographs.panoramas[index]).links_at is None:
             self.state.show_message("a note is put at a panorama of a folder; open the folder of this one")
             return
         away = photographs.pose(index)[:3, :3].T @ camera.rotation[:, 2]

@@ -92,9 +92,8 @@ class Batch(Computation):
         items, model, network = list_items(self.path), self.prediction.model, self.prediction.depth_network
         if Path(model).suffix != "":
             model = str(expand_home(model).absolute())  # of workers in other folders
-        network = None if network is None else expand_home(network).absolute()
-        prediction = replace(self.prediction, model=model, depth_network=network)
-        batch = replace(self, out=report.parent, prediction=prediction)
+        chosen = {"model": model, "depth_network": network and expand_home(network).absolute()}
+        batch = replace(self, out=report.parent, prediction=replace(self.prediction, **chosen))
         fingerprint_work(batch.prediction)  # an unknown model is an error of the command, not of each item
         batch.out.mkdir(parents=True, exist_ok=True)
         try:

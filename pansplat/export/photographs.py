@@ -41,7 +41,6 @@ _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
 _TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
 # Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
 _QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
-_LEAST_ROWS = 2  # of a panorama from which faces are cut
 _SHRINK = 0.95  # of a height that is too large for the page, at most
 _HIDDEN_ROWS = 512  # of the image of the Gaussians in what masks hide
 _GUARD, _FEATHER = 3, 1 / 128  # around it: pixels of which nothing is shown, and of the height, which fade
@@ -150,7 +149,7 @@ def load_photograph(
     photograph: Pair, height: int
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
     """The picture of a pair of one panorama, of at most a height, and where it may be shown: 0 in what masks hide."""
-    views = photograph.load_context(max(min(height, photograph.image_height), _LEAST_ROWS))
+    views = photograph.load_context(max(min(height, photograph.image_height), 2))  # faces need two rows
     image, mask = views.images[0], views.masks[0] & mask_holes(views.images)[0]
     shown = torch.ones(1).expand(mask.shape) if mask.all() else torch.from_numpy(_fade_from_hidden(mask.numpy()))
     return image, shown

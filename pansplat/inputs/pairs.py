@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -74,20 +73,6 @@ class Note:
     addresses: tuple[str, ...] = ()
 
 
-class LinksEntry(NamedTuple):
-    """Where links.json states links and notes of a panorama.
-
-    Attributes:
-        file: the links.json, which need not exist.
-        keys: that stand for the panorama; the first one that the file has counts, else the first one.
-        notes: where the file states none.
-    """
-
-    file: Path
-    keys: tuple[str, ...]
-    notes: tuple[Note, ...] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class Panorama:
     """One panorama file with its pose.
@@ -109,7 +94,8 @@ class Panorama:
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
         frame: where the world of the pose is in the user's world, that of files.
-        links_at: where links and notes are read from; None if no links.json is read.
+        links_at: the links.json that links and notes are read from, the keys there, of which the first that it has
+            counts, and the notes where it states none; None if none is read.
     """
 
     name: str
@@ -127,7 +113,7 @@ class Panorama:
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
     frame: WorldFrame = USER_FRAME
-    links_at: LinksEntry | None = None
+    links_at: tuple[Path, tuple[str, ...], tuple[Note, ...]] | None = None
 
     def __repr__(self) -> str:
         position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())

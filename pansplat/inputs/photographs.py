@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -17,7 +18,7 @@ from pansplat.images.cube_faces import group_faces
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
 from pansplat.images.image_files import is_two_to_one, list_pictures, require_panorama
 from pansplat.images.rig_images import RIG_SUFFIX
-from pansplat.inputs.pairs import MAX_NAMES, Collection, Link, LinksEntry, Note, Panorama, list_panorama_files
+from pansplat.inputs.pairs import MAX_NAMES, Collection, Link, Note, Panorama, list_panorama_files
 from pansplat.inputs.web_tours.entries import (
     Number,
     make_note,
@@ -153,7 +154,7 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
     """
     source, content = folder / LINKS, {}
     try:
-        content = read_json(source, dict[str, Any]) if source.is_file() else {}
+        content = _read_links(source)
     except InputError as error:
         warnings.warn(f"links are left out: {error}", category=InputWarning, stacklevel=3)
     counts = Counter(
@@ -167,9 +168,9 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
     result = []
     for panorama in panoramas:
         own = [key for key in _list_keys(panorama, folder) if key in names] or [panorama.name]
-        result.append(dataclasses.replace(panorama, links_at=LinksEntry(source, tuple(own), panorama.notes)))
+        result.append(dataclasses.replace(panorama, links_at=(source, tuple(own), panorama.notes)))
         try:
-            result[-1] = _add_entry(result[-1], content.get(_find_key(own, content), {}), names, source)
+            result[-1] = _add_entry(result[-1], _find_entry(own, content, source)[1], names, source)
         except InputError as error:
             warnings.warn(f"links of {panorama.name} are left out: {error}", category=InputWarning, stacklevel=3)
     return result
@@ -184,35 +185,28 @@ def _list_keys(panorama: Panorama, folder: Path) -> list[str]:
     return list(dict.fromkeys((path, image.name, panorama.name)))
 
 
-def _find_key(keys: Sequence[str], content: Container[str]) -> str:
-    return next((key for key in keys if key in content), keys[0])
+def _find_entry(keys: Sequence[str], content: dict[str, Any], source: Path) -> tuple[str, dict[str, Any]]:
+    """The key of a panorama, and its entry, which may be a list of links: {"title", "start", "links", "notes"}."""
+    key = next((key for key in keys if key in content), keys[0])
+    entry = content.get(key, {})
+    return key, convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
 
 
-def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
-    """The panorama with the content of its entry: a list of links, or {"title", "start", "links", "notes"}."""
-    content = _as_object(entry, source)
+def _add_entry(panorama: Panorama, content: dict[str, Any], names: dict[str, str], source: Path) -> Panorama:
+    """The panorama with the content of its entry."""
     links = [
         Link(str(link.get("to")), *read_direction({"yaw": None, **link}, source), plain_text(link.get("text")))
         for link in read_field(content, "links", list[dict[str, Any]], source, [])
     ]
+    notes = [_read_note(note, source) for note in read_field(content, "notes", list[dict[str, Any]], source, [])]
     start = read_field(content, "start", tuple[Number, Number], source)
     return dataclasses.replace(
         panorama,
         title=plain_text(content.get("title")) or panorama.title,
         links=resolve_links(links, names, panorama.name, source) if "links" in content else panorama.links,
-        notes=_read_notes(content, source, panorama.notes),
+        notes=tuple(note for note in notes if note.text or note.addresses) if "notes" in content else panorama.notes,
         start=(wrap_angle(start[0]), start[1]) if start else panorama.start,
     )
-
-
-def _as_object(entry: Any, source: Path) -> dict[str, Any]:
-    return convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
-
-
-def _read_notes(entry: dict[str, Any], source: Path, others: tuple[Note, ...]) -> tuple[Note, ...]:
-    """The notes of an entry; others if it states none."""
-    notes = [_read_note(note, source) for note in read_field(entry, "notes", list[dict[str, Any]], source, [])]
-    return tuple(note for note in notes if note.text or note.addresses) if "notes" in entry else others
 
 
 def _read_note(note: dict[str, Any], source: Path) -> Note:
@@ -231,31 +225,28 @@ def describe_notes(notes: Sequence[Note]) -> list[dict[str, Any]]:
 
 def read_notes(panorama: Panorama) -> tuple[Note, ...]:
     """The notes that its links.json states by now; those that were read before if it cannot be read."""
-    if panorama.links_at is None:
-        return panorama.notes
-    try:
-        return _read_notes(_read_entry(panorama.links_at)[2], panorama.links_at.file, panorama.links_at.notes)
-    except (InputError, OSError):
-        return panorama.notes
+    with contextlib.suppress(InputError, OSError):
+        if panorama.links_at is not None:
+            source, keys, others = panorama.links_at
+            _, entry = _find_entry(keys, _read_links(source), source)
+            stated = {key: value for key, value in entry.items() if key == "notes"}
+            return _add_entry(dataclasses.replace(panorama, notes=others), stated, {}, source).notes
+    return panorama.notes
 
 
 def write_notes(
     panorama: Panorama, notes: Sequence[Note], is_replaced: Callable[[Note], bool] = lambda note: False
 ) -> Path:
-    """Add notes of a panorama to its links.json, which keeps all else that it states by now; returns that file.
-
-    Args:
-        panorama: as it was read once.
-        notes: to add.
-        is_replaced: whether a note that is there goes.
+    """Add notes to a panorama's links.json, in place of some; what else it states by now stays. Returns that file.
 
     Raises:
         InputError: links.json cannot be read, or the panorama has none.
     """
     if panorama.links_at is None:
         raise InputError(f"{panorama.image}: needed a panorama of a folder for a note, got a file; open its folder.")
-    source, _, others = panorama.links_at
-    content, key, entry = _read_entry(panorama.links_at)
+    source, keys, others = panorama.links_at
+    content = _read_links(source)
+    key, entry = _find_entry(keys, content, source)
     stated = read_field(entry, "notes", list[dict[str, Any]], source, describe_notes(others))
     kept = [note for note in stated if not is_replaced(_read_note(note, source))]
     content[key] = entry | {"notes": kept + describe_notes(notes)}
@@ -264,8 +255,5 @@ def write_notes(
     return source
 
 
-def _read_entry(at: LinksEntry) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    """The content of a links.json, the key of a panorama, and its entry."""
-    content = read_json(at.file, dict[str, Any]) if at.file.exists() else {}
-    key = _find_key(at.keys, content)
-    return content, key, _as_object(content.get(key, {}), at.file)
+def _read_links(source: Path) -> dict[str, Any]:
+    return read_json(source, dict[str, Any]) if source.is_file() else {}

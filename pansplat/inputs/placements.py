@@ -28,10 +28,10 @@ class ApproximatePlace:
 
     Attributes:
         beside: picture of the panorama that it is relative to.
-        right, forward: of that camera, level, in the unit of its pose, or else in heights of its camera.
+        right, forward: of that camera, level, in the unit of its pose.
         yaw: heading, radians to the right of that camera's.
         by: names of the panoramas whose links state it.
-        is_in_heights: whether it is in heights of the camera, as the file does not state how long they are.
+        is_in_heights: whether right and forward are in heights of that camera, as no unit is stated.
     """
 
     beside: Path

@@ -337,10 +337,7 @@ def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
         if is_scene_of_tour(path.parent, image):
             names[image] = image.name.removesuffix(CUBE_SUFFIX)
         elif is_scene_of_tour(locate_panorama(image).parent, image):
-            raise InputError(
-                f"{path}: needed a file in the folder of the web tour, where its poses stand, got another folder; "
-                f"give {POSES} beside the tour."
-            )
+            raise InputError(f"{path}: needed the folder of the web tour, where its poses stand, got another one.")
         elif is_assembled(image):
             raise InputError(
                 f"{path}: needed 2:1 photographs or a web tour, got the cube faces of "

@@ -25,8 +25,7 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
     stays unchanged.
 
     Args:
-        path: the file to write. A symbolic link to a file stays, and that file is replaced; one to nothing is replaced,
-            as whoever made a folder chose where it leads.
+        path: the file to write. A symbolic link to a file stays; one to nothing would choose where to write.
         failures: further exceptions of a library that mean a failed write, such as a full disk.
     """
     path = Path(path)

@@ -157,7 +157,10 @@ def cache_folders(folder: Path) -> list[Path]:
 @cache
 def _name_temporary() -> Path:
     """The temporary folder of this process, which is made when a file is written."""
-    folder = Path(tempfile.gettempdir()) / f"pansplat-{secrets.token_hex(8)}"
+    base = os.devnull  # below which nothing can be written
+    with contextlib.suppress(OSError):
+        base = tempfile.gettempdir()
+    folder = Path(base) / f"pansplat-{secrets.token_hex(8)}"
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 

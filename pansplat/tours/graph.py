@@ -155,8 +155,8 @@ class TourGraph:
 
     def _find_scale(self, about: ApproximatePlace, beside: int) -> float:
         """Metres of the tour's world that are 1 in a place beside a panorama."""
-        panorama = self.panoramas[beside]
-        return panorama.camera_height if about.is_in_heights else 1 / panorama.frame.unit
+        view = self.panoramas[beside]
+        return view.camera_height if about.is_in_heights else 1 / view.frame.unit
 
     def draw(self, node: int, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Where a plan shows places around a node, to the right and forward of the level axes."""

@@ -253,5 +253,5 @@ def test_poses_of_a_tour_stand_in_its_folder(linked: Path, estimator, refusal) -
     other.mkdir()
     for _ in range(2):
         error = refusal("pose", linked, "-o", other / "poses.json")
-        assert "needed a file in the folder of the web tour, where its poses stand, got another folder" in error
+        assert "needed the folder of the web tour, where its poses stand, got another" in error
         (other / "data.js").write_text((linked / "data.js").read_text())

@@ -622,8 +622,8 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
 def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
     """Notes of before, of another window or by hand stay, also where poses were found since, or the key is another."""
     app, file = make_app(), house.folder / "links.json"
-    keys = ("room0.png", "room0")
-    first, *others = (replace(p, links_at=p.links_at._replace(keys=keys)) for p in house.panoramas)
+    first, *others = house.panoramas
+    first = replace(first, links_at=(file, ("room0.png", "room0"), ()))
     entries = [SceneEntry("house", tour=replace(house, panoramas=(first, *others))), SceneEntry("other")]
     posed = replace(house, panoramas=(replace(first), *others))  # as it was loaded, before any note
     app.show(*entries)

@@ -155,11 +155,8 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
             found |= {view.image: view for view in tour.originals or tour.panoramas}
         elif pair is not None and pair.folder == folder:
             found |= {view.image: view for view in pair.context + pair.targets}
-    views = (
-        replace(view.in_frame(USER_FRAME), camera_height=view.frame.unit * view.camera_height)
-        for view in found.values()
-    )
-    return sorted(views, key=lambda view: view.name)
+    views = [replace(view, camera_height=view.frame.unit * view.camera_height) for view in found.values()]
+    return sorted((view.in_frame(USER_FRAME) for view in views), key=lambda view: view.name)
 
 
 def load_entry(

@@ -154,7 +154,7 @@ def limit_camera(state: ViewerState, before: Camera) -> None:
         return
     place = bounds.limit_step(np.array(before.position), np.array(camera.position))
     state.camera = replace(camera, position=tuple(place.tolist()))
-    if not state.has_stopped and not np.allclose(place, camera.position):
+    if state.tour is None and not state.has_stopped and not np.allclose(place, camera.position):
         state.has_stopped = True
         state.show_message("Surfaces stop the camera: no photograph shows what is behind them   (V: orbit around them)")
 

@@ -33,9 +33,8 @@ def is_web_tour_file(file: Path) -> bool:
 
 def is_scene_of_tour(folder: Path, image: Path) -> bool:
     """Whether a panorama is a scene of the web tour in a folder that is made from cube faces."""
-    if not image.name.endswith(CUBE_SUFFIX):
-        return False
-    return locate_panorama(image).parent in [source.parent.resolve() for source in find_web_tours(folder)]
+    tours = find_web_tours(folder) if image.name.endswith(CUBE_SUFFIX) else []
+    return any(source.parent.resolve() == locate_panorama(image).parent for source in tours)
 
 
 def read_web_tour(source: Path, folder: Path, convention: str | None = None) -> Collection:
