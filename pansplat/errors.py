@@ -15,6 +15,10 @@ class InputError(ValueError):
     """
 
 
+class NothingFoundError(InputError):
+    """There is nothing at a path that could be panoramas."""
+
+
 class InputWarning(UserWarning):
     """Input that pansplat can use in part. Commands print it as one line `note: ...`; `collect_notes` lists it."""
 

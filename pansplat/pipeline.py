@@ -33,7 +33,7 @@ from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
-from pansplat.prediction_options import CompatChoice, Precision, PredictOptions
+from pansplat.prediction_options import CompatChoice, Precision, PredictOptions, choose_caches
 from pansplat.predictor import Predictor
 from pansplat.refinement import (
     DISPLAY_HEIGHT,
@@ -382,7 +382,7 @@ def _prepare(
 ) -> _Task:
     """The task of `predict`; what cannot be predicted is refused."""
     seconds = options.refine_seconds
-    with stage(POSED):
+    with stage(POSED), choose_caches(options):
         pair = _load_source(source)
     _require_views(pair, predictor)
     is_single = len(pair.images if isinstance(pair, Views) else pair.context) == 1
@@ -536,7 +536,8 @@ def predict_tour(
     """
     predictor, options = _choose_options(model, options, keywords)
     if isinstance(tour, (str, Path)):
-        return predict_tour(_load_only_tour(tour), predictor, options=options)
+        with choose_caches(options):
+            tour = _load_only_tour(tour)
     if options.refine_seconds is None:
         options = replace(options, refine_seconds=choose_refine_seconds(None, joint=options.joint))
     warn_of_single_views(tour, predictor)

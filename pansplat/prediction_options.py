@@ -6,6 +6,7 @@ Imports no torch, so that `--help` is fast.
 from __future__ import annotations
 
 import dataclasses
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -61,7 +62,7 @@ class PredictOptions:
     gaussians: Annotated[Count | None, Fixed, Suppress] = None
     joint: Annotated[bool, Fixed, Suppress] = False
     cache: bool = True
-    """Read results from the folder of the panoramas, and keep them there; --no-cache does neither."""
+    """Read results, poses too, from the folder of the panoramas, and keep them there; --no-cache does neither."""
 
     def replace(self, **changes: Any) -> PredictOptions:
         """The options with other values; an InputError for what is no option."""
@@ -79,3 +80,15 @@ class PredictOptions:
 
 _OF_PREDICTOR = "model", "compat", "precision", "depth_network"  # parts of its fingerprint
 _OF_REFINEMENT = "refine_seconds", "gaussians", "joint"
+
+
+def choose_caches(command: Any) -> AbstractContextManager[None]:
+    """A block without caches if options of a prediction, alone or among those of a command, have `--no-cache`."""
+    nested = [command]
+    for each in nested:
+        nested += filter(dataclasses.is_dataclass, vars(each).values())
+    if all(getattr(each, "cache", True) for each in nested):
+        return nullcontext()
+    from pansplat.system.store import without_caches
+
+    return without_caches()

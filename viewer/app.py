@@ -11,7 +11,7 @@ import tyro
 from msgspec import Meta
 
 from pansplat.errors import InputError
-from pansplat.prediction_options import PredictOptions, ReadOptions
+from pansplat.prediction_options import PredictOptions, ReadOptions, choose_caches
 from pansplat.system.console import own_warnings, parse_arguments, print_message, progress_bar
 from pansplat.system.devices import Device, use_device
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
@@ -97,7 +97,7 @@ def run_arguments(args: Sequence[str] | None = None) -> int:
     )
     check_numbers(options)
     say = partial(print_message, "note") if options.verbose else None
-    with own_warnings(), use_device(options.device, say):
+    with own_warnings(), use_device(options.device, say), choose_caches(options):
         return _run(options)
 
 

@@ -20,7 +20,7 @@ from pansplat.tours.route import plan_route
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
-from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour
+from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour, limit_camera
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.photographs import find_open_view
 from pansplat_viewer.ui.stage import Stage
@@ -300,8 +300,11 @@ class Scenes:
         stage.clear()
         stage.photographs.open(entry.panoramas)
         self._entered(entry)
+        state.show_message(f"{entry.name}   (H shows the keys)")
         if entry.tour is None:
             enter_scene(state, loaded.scene, at=self._at)
+            state.bounds = None if loaded.facts is None else loaded.facts.bounds
+            limit_camera(state, state.home)
         else:
             self._enter_tour(loaded, remaining)
         tour, part = self.tour, 0 if self.tour is None else self.tour.part
@@ -312,7 +315,6 @@ class Scenes:
         if is_here or photograph is None:
             stage.fade.show(0, loaded.scene, state.now, part)
         stage.last_camera = state.camera
-        state.show_message(f"{entry.name}   (H shows the keys)")
 
     def _preview(self, entry: SceneEntry) -> None:
         """Show the photographs of an entry until its scene is there; the camera can turn and fly."""

@@ -25,7 +25,8 @@ from imgui_bundle import imgui
 from pansplat.errors import InputError
 from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
-from pansplat.inputs.photographs import write_notes
+from pansplat.inputs.pairs import Note
+from pansplat.inputs.photographs import read_notes, write_notes
 from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.camera_path import read_path, write_path
@@ -277,18 +278,18 @@ class Viewer:
         """State a note at the middle of the image, in place of one that is there; without a text remove that one."""
         photographs, camera = self.stage.photographs, self.state.camera
         index = photographs.find_stop(np.asarray(camera.position))
-        if index is None or photographs.panoramas[index].links_at is None:
+        if index is None or (panorama := photographs.panoramas[index]).links_at is None:
             self.state.show_message("a note is put at a panorama of a folder; open the folder of this one")
             return
         away = photographs.pose(index)[:3, :3].T @ camera.rotation[:, 2]
-        kept = photographs.list_notes(index)
-        angles = [away @ find_direction(torch.eye(4), note.yaw, note.pitch).numpy() for note in kept]
-        kept = tuple(note for note, cosine in zip(kept, angles, strict=True) if cosine < _NOTE_COSINE)
         yaw, pitch = find_angles(away)
-        notes = (*kept, make_note((yaw, -pitch), text)) if text.strip() else kept
+
+        def is_here(note: Note) -> bool:
+            return float(away @ find_direction(torch.eye(4), note.yaw, note.pitch).numpy()) >= _NOTE_COSINE
+
         with self._showing_errors():
-            file = write_notes(photographs.panoramas[index], notes)
-            photographs.change_notes(index, notes)
+            file = write_notes(panorama, [make_note((yaw, -pitch), text)] if text.strip() else [], is_here)
+            photographs.change_notes(index, read_notes(panorama))
             self.state.show_message(f"wrote {file}")
 
     def save_path(self, text: str) -> None:

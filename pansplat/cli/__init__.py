@@ -36,12 +36,13 @@ def run(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status; help and misspelt arguments raise SystemExit."""
 
     def run_parsed() -> int:
+        from pansplat.prediction_options import choose_caches
         from pansplat.system.options import check_numbers
 
         command = parse(argv)
         check_numbers(command)
         say = partial(print_message, "note") if getattr(command, "verbose", False) else None
-        with own_warnings(), use_device(getattr(command, "device", None), say):
+        with own_warnings(), use_device(getattr(command, "device", None), say), choose_caches(command):
             return command.run()
 
     return run_command(

@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,7 +29,7 @@ from tyro.conf import Positional, arg
 from pansplat.cli.export import Export, Page
 from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction
 from pansplat.errors import InputError, collect_notes
-from pansplat.prediction_options import PredictOptions, ReadOptions
+from pansplat.prediction_options import PredictOptions, ReadOptions, choose_caches
 from pansplat.system.console import is_out_of_memory, print_message, progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.devices import with_device
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 STEPS = ("predict", "refine", "export")
 REPORT_NAME = "report.jsonl"
+_PROGRAM, _PROGRAM_SUFFIXES = ("pansplat.web", "pansplat.shaders"), (".js", ".html", ".css", ".glsl", ".vert", ".frag")
 _MAX_NAME = 40  # letters of a pair's name in the name of an output
 _MEMORY = 4 << 30  # bytes of a worker; decides the default number of workers
 
@@ -87,10 +89,11 @@ class Batch(Computation):
             )
         import locket  # Dask needs it, too
 
-        items, model = list_items(self.path), self.prediction.model
+        items, model, network = list_items(self.path), self.prediction.model, self.prediction.depth_network
         if Path(model).suffix != "":
             model = str(expand_home(model).absolute())  # of workers in other folders
-        batch = replace(self, out=report.parent, prediction=replace(self.prediction, model=model))
+        chosen = {"model": model, "depth_network": network and expand_home(network).absolute()}
+        batch = replace(self, out=report.parent, prediction=replace(self.prediction, **chosen))
         fingerprint_work(batch.prediction)  # an unknown model is an error of the command, not of each item
         batch.out.mkdir(parents=True, exist_ok=True)
         try:
@@ -147,6 +150,7 @@ class Batch(Computation):
         for source in (*tours, *(pair for pair in pairs if pair.context[0].image not in images)):
             panoramas = source.context if isinstance(source, Pair) else source.panoramas
             content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
+            edges = () if isinstance(source, Pair) else source.list_overlaps()
             for step in (step for step in STEPS if step in self.steps):
                 options = self.prediction
                 if step == "predict" or "refine" not in self.steps:
@@ -159,7 +163,7 @@ class Batch(Computation):
                     page=Page(gaussians=self.gaussians if suffix == ".html" else None),
                     prediction=ScenePrediction(options, PairChoice(source.name, self.reading)),
                 )
-                stated = fingerprint_work(self.prediction), step, repr(export), f"{source.near} {source.far}"
+                stated = fingerprint_work(self.prediction), step, repr(export), f"{source.near} {source.far} {edges}"
                 name = make_portable_name(source.name)[:_MAX_NAME].replace(".", "_")
                 found[f"{step}-{hash_parts(*stated, *content)[:16]}-{name}{suffix}"] = replace(export, path=folder)
         return found
@@ -193,7 +197,8 @@ def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict
     """
     began, files, num_made, error = time.perf_counter(), list[Path](), 0, None
     folder = batch.out / item[0]
-    with collect_notes() as notes, contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    silent = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
+    with collect_notes() as notes, silent[0], silent[1], choose_caches(batch):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             _remove_unfinished(folder)
@@ -226,12 +231,14 @@ def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict
 
 @lru_cache(maxsize=1)
 def fingerprint_work(options: PredictOptions) -> str:
-    """A hash of the code and of the weights of a batch, which all its machines have."""
+    """A hash of the code, the program of pages and the weights of a batch, which all its machines have."""
     from pansplat import __version__, pipeline
     from pansplat.system.source_hash import hash_sources
-    from pansplat.system.store import hash_parts
+    from pansplat.system.store import hash_file, hash_parts
 
-    return hash_parts(__version__, hash_sources(__name__), pipeline.load_predictor(options).fingerprint)
+    files = (Path(str(file)) for name in _PROGRAM for file in resources.files(name).iterdir())
+    program = (f"{file.name} {hash_file(file)}" for file in sorted(files) if file.suffix in _PROGRAM_SUFFIXES)
+    return hash_parts(__version__, hash_sources(__name__), *program, pipeline.load_predictor(options).fingerprint)
 
 
 def _describe(error: BaseException) -> str:

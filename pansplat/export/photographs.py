@@ -149,7 +149,7 @@ def load_photograph(
     photograph: Pair, height: int
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
     """The picture of a pair of one panorama, of at most a height, and where it may be shown: 0 in what masks hide."""
-    views = photograph.load_context(min(height, photograph.image_height))
+    views = photograph.load_context(max(min(height, photograph.image_height), 2))  # faces need two rows
     image, mask = views.images[0], views.masks[0] & mask_holes(views.images)[0]
     shown = torch.ones(1).expand(mask.shape) if mask.all() else torch.from_numpy(_fade_from_hidden(mask.numpy()))
     return image, shown

@@ -28,7 +28,7 @@ from numpy import ndarray as Array
 from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_of, face_rotations
 from pansplat.system.files import read_file
-from pansplat.system.store import cache_folders, write_cache_file
+from pansplat.system.store import cache_folders, hash_parts, write_cache_file
 from pansplat.system.strict_json import read_json
 
 CUBE_SUFFIX = ".cube.json"
@@ -130,13 +130,15 @@ def write_description(content: dict[str, Any], pictures: Iterable[Path], folder:
         content: of the file.
         pictures: that the panorama is made from.
         folder: of the tour, in whose cache folder the file is written.
-        name: valid as a file name.
+        name: valid as a file name. The file is in a folder of its content: tours of one folder may have equal names.
     """
+    content |= {BESIDE: str(folder.resolve())}
+    name = f"{hash_parts(json.dumps(content))}/{name}"
     digest = hashlib.blake2b(digest_size=12)
     for picture in pictures:
         status = os.stat(picture)
         digest.update(b"%d %d;" % (status.st_size, status.st_mtime_ns))
-    text = json.dumps(content | {BESIDE: str(folder.resolve()), "pictures": digest.hexdigest()}).encode()
+    text = json.dumps(content | {"pictures": digest.hexdigest()}).encode()
     folders = cache_folders(folder)
     for path in (cache / name for cache in folders):
         if path.is_file() and read_file(path) == text:

@@ -50,7 +50,8 @@ def hash_panorama(panorama: Panorama) -> str:
             return hash_file(value)
         return value.tolist() if isinstance(value, Tensor) else vars(value)
 
-    shown = {"image": hash_image(panorama.image), "placement": panorama.placement.state, "links_at": None}
+    placement = panorama.placement.state, panorama.placement.about
+    shown = {"image": hash_image(panorama.image), "placement": placement, "links_at": None}
     return hash_parts(json.dumps(vars(panorama) | shown, default=describe))
 
 

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputError, InputWarning, NothingFoundError
 from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once, locate_panorama, split_mask_name
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.inputs.folder_formats import PAIRS, POSES
@@ -345,7 +345,8 @@ def _nothing_found(root: Path) -> InputError:
             "none; " if not tables else f"none, and {list_first([file.name for file in tables])}, of no known format; "
         )
         advice = "give the folder that holds the pictures; docs/input.md lists the formats of poses"
-    return InputError(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP or EXR), got {got}{advice}.")
+    kind = InputError if inside or others else NothingFoundError
+    return kind(f"{root}: needed panoramas (JPG, PNG, TIFF, WebP or EXR), got {got}{advice}.")
 
 
 def _advise_on_file(file: Path) -> str:

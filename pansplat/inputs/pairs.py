@@ -94,7 +94,8 @@ class Panorama:
         camera_height: over the floor, metres; the scale of a scene of this panorama alone.
         placement: how the pose was found, or why there is none.
         frame: where the world of the pose is in the user's world, that of files.
-        links_at: the links.json that links and notes are read from, and the key there; None if none is read.
+        links_at: the links.json that links and notes are read from, the keys there, of which the first that it has
+            counts, and the notes where it states none; None if none is read.
     """
 
     name: str
@@ -112,7 +113,7 @@ class Panorama:
     camera_height: float = CAMERA_HEIGHT
     placement: Placement = PLACED
     frame: WorldFrame = USER_FRAME
-    links_at: tuple[Path, str] | None = None
+    links_at: tuple[Path, tuple[str, ...], tuple[Note, ...]] | None = None
 
     def __repr__(self) -> str:
         position = ", ".join(f"{x:.3g}" for x in self.cam2world[:3, 3].tolist())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,7 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
     """
     source, content = folder / LINKS, {}
     try:
-        content = read_json(source, dict[str, Any]) if source.is_file() else {}
+        content = _read_links(source)
     except InputError as error:
         warnings.warn(f"links are left out: {error}", category=InputWarning, stacklevel=3)
     counts = Counter(
@@ -167,10 +168,9 @@ def add_links(panoramas: Sequence[Panorama], folder: Path) -> list[Panorama]:
     result = []
     for panorama in panoramas:
         own = [key for key in _list_keys(panorama, folder) if key in names] or [panorama.name]
-        key = next((key for key in own if key in content), own[0])
-        result.append(dataclasses.replace(panorama, links_at=(source, key)))
+        result.append(dataclasses.replace(panorama, links_at=(source, tuple(own), panorama.notes)))
         try:
-            result[-1] = _add_entry(result[-1], content.get(key, {}), names, source)
+            result[-1] = _add_entry(result[-1], _find_entry(own, content, source)[1], names, source)
         except InputError as error:
             warnings.warn(f"links of {panorama.name} are left out: {error}", category=InputWarning, stacklevel=3)
     return result
@@ -185,21 +185,20 @@ def _list_keys(panorama: Panorama, folder: Path) -> list[str]:
     return list(dict.fromkeys((path, image.name, panorama.name)))
 
 
-def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Path) -> Panorama:
-    """The panorama with the content of its entry: a list of links, or {"title", "start", "links", "notes"}."""
-    content = convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
+def _find_entry(keys: Sequence[str], content: dict[str, Any], source: Path) -> tuple[str, dict[str, Any]]:
+    """The key of a panorama, and its entry, which may be a list of links: {"title", "start", "links", "notes"}."""
+    key = next((key for key in keys if key in content), keys[0])
+    entry = content.get(key, {})
+    return key, convert({"links": entry} if isinstance(entry, list) else entry, dict[str, Any], source)
+
+
+def _add_entry(panorama: Panorama, content: dict[str, Any], names: dict[str, str], source: Path) -> Panorama:
+    """The panorama with the content of its entry."""
     links = [
         Link(str(link.get("to")), *read_direction({"yaw": None, **link}, source), plain_text(link.get("text")))
         for link in read_field(content, "links", list[dict[str, Any]], source, [])
     ]
-    notes = [
-        make_note(
-            read_direction(note, source),
-            read_field(note, "text", str, source, ""),
-            read_field(note, "addresses", list, source, []),
-        )
-        for note in read_field(content, "notes", list[dict[str, Any]], source, [])
-    ]
+    notes = [_read_note(note, source) for note in read_field(content, "notes", list[dict[str, Any]], source, [])]
     start = read_field(content, "start", tuple[Number, Number], source)
     return dataclasses.replace(
         panorama,
@@ -208,6 +207,11 @@ def _add_entry(panorama: Panorama, entry: Any, names: dict[str, str], source: Pa
         notes=tuple(note for note in notes if note.text or note.addresses) if "notes" in content else panorama.notes,
         start=(wrap_angle(start[0]), start[1]) if start else panorama.start,
     )
+
+
+def _read_note(note: dict[str, Any], source: Path) -> Note:
+    text, addresses = read_field(note, "text", str, source, ""), read_field(note, "addresses", list, source, [])
+    return make_note(read_direction(note, source), text, addresses)
 
 
 def describe_notes(notes: Sequence[Note]) -> list[dict[str, Any]]:
@@ -219,19 +223,37 @@ def describe_notes(notes: Sequence[Note]) -> list[dict[str, Any]]:
     ]
 
 
-def write_notes(panorama: Panorama, notes: Sequence[Note]) -> Path:
-    """Replace the notes of a panorama in its links.json, which keeps all else that it states; returns that file.
+def read_notes(panorama: Panorama) -> tuple[Note, ...]:
+    """The notes that its links.json states by now; those that were read before if it cannot be read."""
+    with contextlib.suppress(InputError, OSError):
+        if panorama.links_at is not None:
+            source, keys, others = panorama.links_at
+            _, entry = _find_entry(keys, _read_links(source), source)
+            stated = {key: value for key, value in entry.items() if key == "notes"}
+            return _add_entry(dataclasses.replace(panorama, notes=others), stated, {}, source).notes
+    return panorama.notes
+
+
+def write_notes(
+    panorama: Panorama, notes: Sequence[Note], is_replaced: Callable[[Note], bool] = lambda note: False
+) -> Path:
+    """Add notes to a panorama's links.json, in place of some; what else it states by now stays. Returns that file.
 
     Raises:
         InputError: links.json cannot be read, or the panorama has none.
     """
     if panorama.links_at is None:
         raise InputError(f"{panorama.image}: needed a panorama of a folder for a note, got a file; open its folder.")
-    source, key = panorama.links_at
-    content = read_json(source, dict[str, Any]) if source.exists() else {}
-    entry = content.get(key, {})
-    entry = {"links": entry} if isinstance(entry, list) else convert(entry, dict[str, Any], source)
-    content[key] = entry | {"notes": describe_notes(notes)}
+    source, keys, others = panorama.links_at
+    content = _read_links(source)
+    key, entry = _find_entry(keys, content, source)
+    stated = read_field(entry, "notes", list[dict[str, Any]], source, describe_notes(others))
+    kept = [note for note in stated if not is_replaced(_read_note(note, source))]
+    content[key] = entry | {"notes": kept + describe_notes(notes)}
     with replacing(source) as temporary:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), "utf-8")
     return source
+
+
+def _read_links(source: Path) -> dict[str, Any]:
+    return read_json(source, dict[str, Any]) if source.is_file() else {}

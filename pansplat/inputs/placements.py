@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 from msgspec import Struct
 
 from pansplat.errors import InputError
-from pansplat.system.options import CAMERA_HEIGHT
 from pansplat.system.strict_json import convert
 
 State = Literal["placed", "probable", "by hand", "not placed"]
@@ -32,6 +31,7 @@ class ApproximatePlace:
         right, forward: of that camera, level, in the unit of its pose.
         yaw: heading, radians to the right of that camera's.
         by: names of the panoramas whose links state it.
+        is_in_heights: whether right and forward are in heights of that camera, as no unit is stated.
     """
 
     beside: Path
@@ -39,6 +39,7 @@ class ApproximatePlace:
     forward: float
     yaw: float
     by: tuple[str, ...] = ()
+    is_in_heights: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,9 +129,9 @@ def read_approximate(
             stated = convert(entry, _Stated, "approximate")
             beside, name = stated.between
             if beside in images and name in images and beside != name:
-                unit, (right, forward, yaw) = units.get(beside) or CAMERA_HEIGHT, stated.place
-                place = images[beside], unit * right, unit * forward, yaw
-                found[images[name]] = ApproximatePlace(*place, tuple(stated.by))
+                unit, (right, forward, yaw) = units.get(beside), stated.place
+                place = images[beside], (unit or 1) * right, (unit or 1) * forward, yaw
+                found[images[name]] = ApproximatePlace(*place, tuple(stated.by), is_in_heights=unit is None)
     return found
 
 
@@ -206,7 +207,9 @@ def _measure_depths(start: int, edges: Collection[tuple[int, int]]) -> dict[int,
     return depth
 
 
-def judge(names: Sequence[str], ties: Iterable[Tie], by_hand: Collection[str], source: Path) -> dict[str, Placement]:
+def judge(
+    names: Sequence[str], ties: Iterable[Tie], by_hand: Collection[str], source: Path | None
+) -> dict[str, Placement]:
     """The placements of the panoramas of one group; see `find_holds`."""
     if len(names) == 1:
         return {names[0]: Placement("not placed", "no other panorama has a pose with it", source)}

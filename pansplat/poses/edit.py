@@ -21,6 +21,7 @@ from msgspec import Meta
 from numpy import ndarray as Array
 
 from pansplat.errors import InputError, InputWarning
+from pansplat.images.blur_masks import locate_panorama
 from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled
 from pansplat.inputs.folder_formats import MATRIX_KEYS
@@ -335,6 +336,8 @@ def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
     for image in images:
         if is_scene_of_tour(path.parent, image):
             names[image] = image.name.removesuffix(CUBE_SUFFIX)
+        elif is_scene_of_tour(locate_panorama(image).parent, image):
+            raise InputError(f"{path}: needed the folder of the web tour, where its poses stand, got another one.")
         elif is_assembled(image):
             raise InputError(
                 f"{path}: needed 2:1 photographs or a web tour, got the cube faces of "

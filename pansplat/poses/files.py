@@ -142,10 +142,8 @@ def estimate_pairs(
             on_unposed(localize_pairs(make_names_unique(single), camera_height))
         content = _estimate(folder, panoramas, camera_height)
         store.write(_KIND, key, content)
-    sources = store.find(_KIND, key)
-    if not sources:
-        raise InputError(f"{folder}: needed a writable cache folder for the poses, got none; make one.")
-    pairs = _make_pairs(folder, panoramas, content, sources[0], near, far)
+    source = next(iter(store.find(_KIND, key)), None)  # None if no folder at all can be written
+    pairs = _make_pairs(folder, panoramas, content, source, near, far)
     return localize_pairs(make_names_unique(pairs), camera_height)
 
 
@@ -188,11 +186,11 @@ def _make_pairs(
     folder: Path,
     panoramas: Sequence[Panorama],
     content: Mapping[str, Any],
-    source: Path,
+    source: Path | None,
     near: float | None,
     far: float | None,
 ) -> list[Pair]:
-    """The pairs of a cached estimate, with its warnings."""
+    """The pairs of an estimate, with its warnings."""
     by_name = {panorama.name: panorama for panorama in panoramas}
     unplaced, unreadable = content["unplaced"], content["unreadable"]
     if content["worlds"]:
@@ -226,7 +224,7 @@ def _make_pairs(
             for name, pose in world["poses"].items()
         )
         only = folder.resolve().name if len(placed) == 2 else None
-        found = Collection(source, folder, placed, near=world["near"], far=world["far"], name=only)
+        found = Collection(source or folder, folder, placed, near=world["near"], far=world["far"], name=only)
         pairs += found.pairs(near, far)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
     single = [

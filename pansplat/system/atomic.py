@@ -25,10 +25,12 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
     stays unchanged.
 
     Args:
-        path: the file to write.
+        path: the file to write. A symbolic link to a file stays; one to nothing would choose where to write.
         failures: further exceptions of a library that mean a failed write, such as a full disk.
     """
     path = Path(path)
+    if path.is_symlink() and path.exists():
+        path = Path(os.path.realpath(path))
     if not path.parent.is_dir():
         raise InputError(f"cannot write {path}: needed an existing folder, got {path.parent}; create it first")
     if path.is_dir():

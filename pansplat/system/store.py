@@ -1,6 +1,7 @@
 """The store: what is computed from a folder's panoramas, in files by the hash of all that it depends on.
 
-An entry, `KIND-KEY.entry`, is in `.pansplat/` of the folder, or in the user's cache folder if that cannot be written.
+An entry, `KIND-KEY.entry`, is in `.pansplat/` of the folder, or in the user's cache folder if that cannot be written,
+or else, and without caches (`without_caches`), in a temporary folder, which is removed when the process ends.
 It is safetensors, whose metadata is a tree of JSON, and a CRC-32. Entries appear complete or not at all, and processes
 may share a folder. The entries that were used least recently are removed when they have more than `LIMIT` bytes
 together, but none that this process has used, or another one in the last hour.
@@ -8,16 +9,21 @@ together, but none that this process has used, or another one in the last hour.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import hashlib
 import json
 import os
+import secrets
+import shutil
+import tempfile
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,8 +44,19 @@ _FORMAT = "1"  # of entries; part of their keys
 _TREE = "tree"  # name of the metadata
 
 _used: set[str] = set()  # entries of this process
+_block: ContextVar[str] = ContextVar("block", default="")  # name of one without caches
 
 Value = TypeVar("Value")
+
+
+@contextlib.contextmanager
+def without_caches() -> Iterator[None]:
+    """Nothing is read from caches or kept there in the block."""
+    token = _block.set(_block.get() or secrets.token_hex(8))
+    try:
+        yield
+    finally:
+        _block.reset(token)
 
 
 class Store:
@@ -133,14 +150,30 @@ def cache_folders(folder: Path) -> list[Path]:
     with contextlib.suppress(InputError):  # no home folder
         home = os.environ.get("XDG_CACHE_HOME") or expand_home("~/.cache")
         folders.append(Path(home) / "pansplat" / folder_hash)
-    return folders
+    block = _block.get()
+    return [*(() if block else folders), _name_temporary() / (block + folder_hash)]
+
+
+@cache
+def _name_temporary() -> Path:
+    """The temporary folder of this process, which is made when a file is written."""
+    base = os.devnull  # below which nothing can be written
+    with contextlib.suppress(OSError):
+        base = tempfile.gettempdir()
+    folder = Path(base) / f"pansplat-{secrets.token_hex(8)}"
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def write_cache_file(folders: Sequence[Path], name: str, content: bytes) -> Path | None:
     """Write a file to the first writable folder; returns its path, or None if there is no such folder."""
     for folder in folders:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            if folder.parent == _name_temporary():
+                folder.parent.mkdir(0o700, exist_ok=True)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            if (folder / name).is_symlink():  # made by whoever made the folder
+                (folder / name).unlink()
             with replacing(folder / name) as unfinished:
                 unfinished.write_bytes(content)
         except (OSError, InputError):

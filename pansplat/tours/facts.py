@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
 from collections.abc import Callable
 from functools import cached_property
@@ -125,6 +127,13 @@ class TourFacts:
     def clearances(self) -> Float[np.ndarray, "view row bin"]:
         """Distances of the nearest surfaces around the cameras (`measure_clearance`)."""
         return np.stack([measure_clearance(self.scene, k, self.level) for k in range(len(self.views))])
+
+    @cached_property
+    def bounds(self) -> TourGraph:
+        """The graph of a scene without edges whose surfaces stop cameras, which may fly between any two panoramas."""
+        edges = [*itertools.combinations(self.views, 2)] or [(node, node) for node in self.views]
+        clearances = dict(zip(self.views, self.clearances, strict=True))
+        return dataclasses.replace(self.tour, overlaps=dict.fromkeys(edges, 1.0), clearances=clearances)
 
     @_stored
     def hidden(self) -> list[list[int]]:

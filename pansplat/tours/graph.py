@@ -148,10 +148,15 @@ class TourGraph:
                 yaw, own = (
                     math.atan2(*(self.level_axes.T @ self.cam2world[n, :3, 2].numpy())[::2]) for n in (beside, node)
                 )
-                offset = np.array((about.right, about.forward)) / self.panoramas[beside].frame.unit
+                offset = np.array((about.right, about.forward)) * self._find_scale(about, beside)
                 place = self.positions[beside] @ self.level_axes[:, (0, 2)] + offset @ _turn_plan(yaw)
                 found[node] = DrawnPlace(beside, place, wrap_angle(yaw + about.yaw - own))
         return found
+
+    def _find_scale(self, about: ApproximatePlace, beside: int) -> float:
+        """Metres of the tour's world that are 1 in a place beside a panorama."""
+        view = self.panoramas[beside]
+        return view.camera_height if about.is_in_heights else 1 / view.frame.unit
 
     def draw(self, node: int, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Where a plan shows places around a node, to the right and forward of the level axes."""
@@ -652,9 +657,10 @@ def merge_scenes(tour: TourGraph, load: Callable[[ViewNumbers], Scene], max_view
         ),
         starts=list_starts(tour.panoramas),
         approximate=tuple(
-            (node, drawn.beside, about.right, about.forward, wrap_angle(about.yaw))
+            (node, drawn.beside, scale * about.right, scale * about.forward, wrap_angle(about.yaw))
             for node, drawn in tour.approximate.items()
             if (about := tour.panoramas[node].placement.about) is not None
+            and (scale := tour._find_scale(about, drawn.beside) * tour.panoramas[drawn.beside].frame.unit)
         ),
     )
     return dataclasses.replace(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +136,46 @@ def test_a_tour_and_each_pair_beside_it_have_one_file_of_each_step(
     assert sorted(views) == [2, 2, 3]
     process(house, out, "predict", prediction=PredictOptions("sphere", height=80))
     assert len(list_outputs(out)) == 6
+
+
+def test_other_pairs_and_approximate_places_have_outputs_of_other_names(
+    tmp_path: Path, sphere: None, write_tour: Callable[..., Path]
+) -> None:
+    house, seen = write_tour(tmp_path / "house", 4, height=HEIGHT), set()
+    poses = json.loads((house / "poses.json").read_text())
+    del poses["poses"]["p3.png"]
+    place = {"between": ["p0.png", "p3.png"], "place": [0, 1, 0]}
+    for number, (middle, places) in enumerate(
+        ((1, []), (1, [place]), (1, [place | {"place": [0, 2, 0]}]), (1, [place | {"by": ["p1.png"]}]), (0, []))
+    ):
+        pairs = [{"context": ["p0.png", "p1.png"]}, {"context": [f"p{middle}.png", "p2.png"]}]
+        (house / "pairs.json").write_text(json.dumps({"pairs": pairs}))
+        (house / "poses.json").write_text(json.dumps(poses | {"estimate": {"approximate": places}}))
+        with pytest.warns(UserWarning, match=r"no pose of p3\.png"):
+            seen |= set(Batch(tmp_path, tmp_path, do="export", prediction=SPHERE).list_exports(house))
+        assert len(seen) > number
+
+
+def test_the_fingerprint_is_that_of_the_program_of_pages(tmp_path: Path, sphere: None, monkeypatch) -> None:
+    folders = {name: shutil.copytree(str(resources.files(name)), tmp_path / name) for name in batch._PROGRAM}
+    monkeypatch.setattr(resources, "files", folders.__getitem__)
+    seen = {fingerprint_work(SPHERE)}
+    for suffix in ("js", "html", "css", "glsl", "vert", "frag"):
+        for file in [file for folder in folders.values() for file in folder.glob(f"*.{suffix}")][:1]:
+            file.write_text(file.read_text() + " ")
+        fingerprint_work.cache_clear()
+        seen.add(fingerprint_work(SPHERE))
+    assert len(seen) == 7
+
+
+def test_files_of_weights_have_whole_paths_on_workers(rooms: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    batches: list[Batch] = []
+    monkeypatch.setattr(batch, "fingerprint_work", lambda options: "1")
+    monkeypatch.setattr(Batch, "_run_items", lambda self, items: batches.append(self) or Counter())
+    assert run(["batch", "rooms", "-o", "out", "--model", "a.safetensors", "--depth-network", "b.onnx"]) == 0
+    assert batches[0].prediction.model == str(tmp_path / "a.safetensors")
+    assert batches[0].prediction.depth_network == tmp_path / "b.onnx"
 
 
 def test_the_export_of_a_refined_scene_is_refined(rooms: Path, tmp_path: Path, sphere: None) -> None:

@@ -11,15 +11,20 @@ from PIL import Image
 
 import pansplat
 from pansplat.cli import run
+from pansplat.cli.batch import Batch, fingerprint_work, process_item
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
 from pansplat.poses.two_view import RelativePose
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import is_progress_shown
+from pansplat.system.store import Store
+from pansplat_viewer import run as run_viewer
 from pansplat_viewer.scene.loader import find_entries
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+SPHERE = PredictOptions("sphere", height=64, refine_seconds=0.0, cache=False)
 
 
 def _photograph(seed: int) -> np.ndarray:
@@ -145,6 +150,53 @@ def test_all_commands_estimate_poses_from_the_same_arguments(linked: Path, tmp_p
     assert len(images) == 3 and options["links"][images[0]] == {images[1]: pytest.approx(1.5, abs=0.1)}
 
 
+QUICK = "--no-cache", "--model", "sphere", "--refine", "0"
+WITHOUT_CACHES = {
+    "predict": lambda folder, out: run(["predict", str(folder), *QUICK, "-o", str(out / "s.ply")]),
+    "export": lambda folder, out: run(["export", str(folder), *QUICK, "-o", str(out / "tour.html")]),
+    "batch": lambda folder, out: process_item(
+        ("tour", folder), Batch(folder, out, prediction=SPHERE), fingerprint_work(SPHERE)
+    ),
+    "predict_tour": lambda folder, out: pansplat.predict_tour(folder, "sphere", cache=False),
+    "the window": lambda folder, out: run_viewer(
+        [str(folder), "--offscreen", str(out), *QUICK, "--renderer", "cpu", "--size", "32x32", "--seconds", "0.1"]
+    ),
+}
+
+
+@pytest.mark.parametrize("linked", ["a web tour of cube faces"], indirect=True)
+def test_without_caches_no_file_is_written_to_them_or_read(
+    linked: Path, tmp_path: Path, estimator, monkeypatch
+) -> None:
+    """Poses, overlaps, the floor plan, and the descriptions of cube faces, of a folder without poses."""
+    calls, cache, out = [], tmp_path / "cache", linked.parent / "out"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.chdir(tmp_path)
+    out.mkdir()
+    fingerprint_work.cache_clear()
+
+    def estimate(images, cache_folder: Path, **options) -> PoseEstimate:
+        calls.append(Store(cache_folder).get("features", "of a photograph", lambda: len(calls)))
+        return _place_two(images)
+
+    def list_files() -> dict[Path, int]:
+        files = [file for folder in (linked, cache) for file in folder.rglob("*")]
+        return {file: file.stat().st_mtime_ns for file in files}
+
+    estimator(estimate)
+    before = list_files()
+    for number, (name, call) in enumerate(WITHOUT_CACHES.items(), start=1):
+        call(linked, out)
+        assert len(calls) >= number and list_files() == before, name
+    pansplat.predict_tour(linked, "sphere")
+    kept, calls = list_files(), []
+    kinds = {file.name.split("-")[0] for file in kept if file.suffix == ".entry"}
+    assert {"poses", "overlaps", "features", "prediction"} <= kinds, "with caches there are files"
+    pansplat.predict_tour(linked, "sphere", cache=False)
+    assert list_files() == kept and calls == [0], "nothing is read"
+    fingerprint_work.cache_clear()
+
+
 @pytest.mark.parametrize("command", ["predict", "render", "export", "refine"])
 def test_commands_show_the_estimate_of_poses(command: str, folder: Path, tmp_path: Path, estimator) -> None:
     shown = []
@@ -202,3 +254,15 @@ def test_poses_of_cube_faces_beside_each_other_are_refused_before_the_estimate(
     assert run(["pose", str(tmp_path), "-o", str(tmp_path / "poses.json")]) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert "got the cube faces of a, of which it holds no poses" in error and "--photos" in error
+
+
+@pytest.mark.parametrize("linked", ["a web tour of cube faces"], indirect=True)
+def test_poses_of_a_tour_stand_in_its_folder(linked: Path, estimator, refusal) -> None:
+    """Not in any other one, also if it has a tour."""
+    estimator(_refuse)
+    other = linked.parent / "other"
+    other.mkdir()
+    for _ in range(2):
+        error = refusal("pose", linked, "-o", other / "poses.json")
+        assert "needed the folder of the web tour, where its poses stand, got another" in error
+        (other / "data.js").write_text((linked / "data.js").read_text())

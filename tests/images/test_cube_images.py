@@ -91,6 +91,15 @@ def test_the_file_changes_with_the_pictures_only(cube: CubeImage, tmp_path: Path
     assert write_cube(cube, tmp_path, "hall").stat().st_mtime_ns != 1
 
 
+def test_cubes_of_one_name_and_folder_have_files_of_their_own(cube: CubeImage, tmp_path: Path, check_colors) -> None:
+    file = write_cube(cube, tmp_path, "room")
+    faces = tuple(face.replace("f/", "b/") for face in cube.levels[0].faces)
+    other = write_cube(CubeImage(tmp_path, (CubeLevel(16, 16, faces),)), tmp_path, "room")
+    assert other.name == file.name == "room.cube.json" and other != file
+    check_colors(read_panorama(file, 64)[0], tolerance=6)
+    assert write_cube(cube, tmp_path, "room") == file
+
+
 def test_missing_pictures_are_named(cube: CubeImage, tmp_path: Path) -> None:
     path = write_cube(cube, tmp_path, "hall")
     (tmp_path / "40/l/1_2.jpg").unlink()

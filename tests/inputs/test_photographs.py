@@ -97,11 +97,11 @@ def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
     )
     assert one.notes == () and two.notes == (note,)
     write_notes(one, [note])
-    write_notes(two, [*two.notes, Note(3, 0, "window")])
+    write_notes(two, [Note(3, 0, "window")])
     one, two = load_panoramas(rooms)
     assert one.notes == (note,) and one.links == (Link("p02", 0.5),)
     assert two.notes == (note, Note(3, 0, "window")) and two.title == "Bad"
-    write_notes(two, [])
+    write_notes(two, [], lambda note: True)
     content = json.loads((rooms / "links.json").read_text("utf-8"))
     assert content["p02"] == {"title": "Bad", "notes": [], "colour": "blue"} and content["p01.jpg"]["links"] == links
     assert load_panoramas(rooms)[1].notes == ()

@@ -62,6 +62,15 @@ def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Pat
         monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
 
 
+def test_without_a_folder_to_write_to_estimated_poses_are_used(tmp_path: Path, monkeypatch) -> None:
+    _write(tmp_path, "a.png", "b.png", "c.png")
+    monkeypatch.setattr("pansplat.poses.files.estimate_poses", _place(("a.png", "b.png")))
+    monkeypatch.setattr("pansplat.system.store.write_cache_file", lambda *arguments: None)
+    with pytest.warns(UserWarning, match="2 of 3 panoramas"), pytest.warns(UserWarning, match=r"c\.png has no pose"):
+        pair, alone = _load(tmp_path)
+    assert pair.context[1].cam2world[0, 3] == 1 and alone.context[0].placement.state == "not placed"
+
+
 def test_groups_are_worlds_of_their_own(tmp_path: Path, monkeypatch) -> None:
     _write(tmp_path, "a.png", "b.png", "c.png", "d.png", "e.png", "f.png")
     place = _place(("b.png", "d.png", "f.png"), ("a.png", "e.png"))

@@ -96,7 +96,9 @@ def test_another_key_or_kind_has_another_entry(folder: Path) -> None:
     assert sorted(entries.list_values("pair")) == [["pair", "1"], ["pair", "2"]]
 
 
-def test_what_cannot_be_written_to_the_folder_is_in_the_users_cache_or_not_kept(folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_written_to_the_folder_is_in_the_users_cache_or_kept_until_the_end(
+    folder: Path, tmp_path: Path
+) -> None:
     (folder / ".pansplat").write_text("")  # unwritable, for root too
     Store(folder).get("view", "key", lambda: 1)
     assert Store(folder).get("view", "key", fail) == 1 and len(list((tmp_path / "home").rglob("*.entry"))) == 1
@@ -104,8 +106,16 @@ def test_what_cannot_be_written_to_the_folder_is_in_the_users_cache_or_not_kept(
         each.unlink()
     os.rename(tmp_path / "home", tmp_path / "old")
     (tmp_path / "home").write_text("")
-    for entries in (Store(folder), Store(None)):
-        assert [entries.get("view", "key", lambda n=n: n) for n in (2, 3)] == [2, 3]
+    for entries, values in ((Store(folder), [2, 2]), (Store(None), [2, 3])):
+        assert [entries.get("view", "key", lambda n=n: n) for n in (2, 3)] == values
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom pansplat.system.store import Store\n"
+        "store = Store(Path(sys.argv[1]))\nstore.write('view', 'a', 1)\n(file,) = store.find('view', 'a')\n"
+        "assert store.read('view', 'a') == 1\nprint(file, oct(file.parents[1].stat().st_mode))"
+    )
+    result = subprocess.run([sys.executable, "-c", code, folder], capture_output=True, text=True, check=True)
+    file, mode = result.stdout.split()
+    assert mode == "0o40700" and folder not in Path(file).parents and not Path(file).parents[1].exists()
 
 
 def test_what_cannot_be_restored_is_not_written(folder: Path) -> None:

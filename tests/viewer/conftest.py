@@ -268,7 +268,7 @@ def house(tmp_path_factory, axis_photos) -> TourGraph:
         pose = torch.eye(4, dtype=torch.float64)
         pose[0, 3], pose[2, 3] = x, z
         write_image(folder / f"room{index}.png", axis_photos[index % 2])
-        image, at = folder / f"room{index}.png", (folder / "links.json", f"room{index}.png")
+        image, at = folder / f"room{index}.png", (folder / "links.json", (f"room{index}.png",), ())
         panoramas.append(Panorama(f"room{index}", image, pose, links_at=at))
     overlaps = {(0, 1): 0.4, (1, 2): 0.4, (2, 3): 0.4}
     return TourGraph("house tour", folder, tuple(panoramas), 0.45, 10.0, (), overlaps)

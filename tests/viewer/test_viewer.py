@@ -1,5 +1,6 @@
 """State and input of the whole viewer, without OpenGL and without a window: nothing is drawn."""
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ import pytest
 import torch
 from imgui_bundle import imgui
 
+from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.path import find_direction
@@ -615,6 +617,60 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app.viewer.put_note("between")
     assert file.read_bytes() == written and "at a panorama" in app.state.message
     file.unlink()
+
+
+def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
+    """Notes of before, of another window or by hand stay, also where poses were found since, or the key is another."""
+    app, file = make_app(), house.folder / "links.json"
+    first, *others = house.panoramas
+    first = replace(first, links_at=(file, ("room0.png", "room0"), ()))
+    entries = [SceneEntry("house", tour=replace(house, panoramas=(first, *others))), SceneEntry("other")]
+    posed = replace(house, panoramas=(replace(first), *others))  # as it was loaded, before any note
+    app.show(*entries)
+    app.viewer.put_note("one")
+    app.scenes.choose(1)
+    app.settle()
+    for shown in (entries[0], SceneEntry("house", tour=posed)):
+        app.show(shown)
+        index = app.viewer.stage.photographs.find_stop(np.asarray(app.state.camera.position))
+        assert app.viewer.stage.photographs.list_notes(index)[0].text == "one"
+        content = json.loads(file.read_text())
+        (entry,) = content.values()
+        entry["notes"].append({"yaw": 2.0 + len(entry["notes"]), "pitch": 0, "text": "by hand", "colour": "red"})
+        file.write_text(json.dumps({"room0": entry, "of the user": 1}))
+        app.state.camera = replace(app.state.camera, yaw_radians=app.state.camera.yaw_radians + 1)
+        app.viewer.put_note("more")
+        content = json.loads(file.read_text())
+        assert content.keys() == {"room0", "of the user"} and entry["notes"] == content.pop("room0")["notes"][:-1]
+        file.write_text(json.dumps({"room0": entry}))
+    file.unlink()
+    app.viewer.put_note("last")
+    assert [note["text"] for note in json.loads(file.read_text())["room0.png"]["notes"]] == ["last"]
+    file.unlink()
+
+
+def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_predictor, monkeypatch, house):
+    """In the scene of a single photograph, and of two, also if it flew before the scene was there."""
+    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    options = PredictOptions("sphere", height=64, refine_seconds=0.0, cache=False)
+    for views, farthest in (((0,), 1.8), ((0, 1), 2.6)):
+        app = make_app()
+        gate = Gate(lambda entry: load_entry(entry, options), "waiting", 0.0)
+        app.load = gate
+        app.scenes.show([SceneEntry("room", pair=house.make_pair(views))], 0)
+        for _ in range(20):
+            app.frame(0.2, held=frozenset("w"))
+        gate.open()
+        app.settle()
+        assert app.state.has_stopped and 1.7 < np.linalg.norm(app.state.camera.position) < farthest
+        assert "no photograph shows what is behind" in app.state.message
+        app.state.message = ""
+        for _ in range(20):
+            app.frame(0.2, held=frozenset("w"))
+        assert 1.7 < np.linalg.norm(app.state.camera.position) < farthest and not app.state.message
+        for _ in range(10):
+            app.frame(0.2, held=frozenset("s"))
+        assert np.linalg.norm(app.state.camera.position) < 0.6
 
 
 # --- tours ---

@@ -100,6 +100,12 @@ def pack(scene: Scene, photographs: list[Pair], **options: Any) -> list[PackedPh
     return pack_photographs(scene, photographs, **arguments)
 
 
+def test_every_height_of_a_photograph_can_be_packed(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> None:
+    photographs = take_photographs(scene, 64)
+    for height in (1, 2, 3):
+        assert {each.height for each in pack(scene, photographs, height=height)} == {max(height, 2)}
+
+
 def test_the_poster_shows_the_photograph_where_the_page_begins(
     scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
 ) -> None:

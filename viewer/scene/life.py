@@ -12,12 +12,9 @@ state, and a request predicts it again.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
-
-if TYPE_CHECKING:
-    pass
 
 State = Literal["photograph", "predicting", "predicted", "refining", "refined", "failed"]
 

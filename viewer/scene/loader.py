@@ -6,12 +6,13 @@ are parts of the scene in the file. Imports no torch before it loads.
 """
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pansplat.errors import InputError, collect_notes
+from pansplat.errors import InputError, InputWarning, NothingFoundError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
 from pansplat.system.progress import CONNECTED, report_progress, stage
@@ -77,7 +78,7 @@ class LoadedScene:
 
     Attributes:
         is_final: False for a prediction whose refinement will follow.
-        facts: of a scene of a tour.
+        facts: of a scene with cameras.
     """
 
     entry: SceneEntry
@@ -102,19 +103,18 @@ def find_entries(
     if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if is_scene_file(p)) if path.is_dir() else []
-    try:
-        from pansplat.pipeline import load_pairs
-
-        with collect_notes() as notes:
-            on_unposed = None if show is None else lambda pairs: show(_list_tours(pairs))
-            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
-    except InputError:
-        if not scenes:
-            raise
-        pairs, notes = [], []
-    from pansplat.pipeline import load_predictor, warn_of_single_views
+    from pansplat.pipeline import load_pairs, load_predictor, warn_of_single_views
     from pansplat.tours.graph import find_tours
 
+    on_unposed, pairs = None if show is None else lambda pairs: show(_list_tours(pairs)), []
+    with collect_notes() as notes:
+        try:
+            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
+        except InputError as error:
+            if not scenes:
+                raise
+            if not isinstance(error, NothingFoundError):
+                warnings.warn(f"the photographs are left out: {error}", InputWarning, stacklevel=2)
     tours = find_tours(pairs)
     if any(a == b for tour in tours for a, b in tour.overlaps):
         predictor = load_predictor(prediction)
@@ -124,7 +124,7 @@ def find_entries(
         notes += replaced
     entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
-    return entries + [SceneEntry(p.stem, file=p) for p in scenes]
+    return entries + [SceneEntry(p.stem, file=p, notes=tuple(notes)) for p in scenes]
 
 
 def _list_tours(pairs: "list[Pair]") -> list[SceneEntry]:
@@ -145,7 +145,7 @@ def choose_entry(entries: Sequence[SceneEntry], name: str | None) -> int:
 
 
 def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
-    """The photographs of a folder among all entries, in the worlds of its files, by name."""
+    """The photographs of a folder among all entries, in the worlds and the unit of its files, by name."""
     from pansplat.geometry.world import USER_FRAME
 
     found: dict[Path, Panorama] = {}
@@ -155,7 +155,8 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
             found |= {view.image: view for view in tour.originals or tour.panoramas}
         elif pair is not None and pair.folder == folder:
             found |= {view.image: view for view in pair.context + pair.targets}
-    return sorted((view.in_frame(USER_FRAME) for view in found.values()), key=lambda view: view.name)
+    views = [replace(view, camera_height=view.frame.unit * view.camera_height) for view in found.values()]
+    return sorted((view.in_frame(USER_FRAME) for view in views), key=lambda view: view.name)
 
 
 def load_entry(
@@ -180,7 +181,7 @@ def load_entry(
         assert entry.file is not None
         scene = pipeline.load(entry.file)
         if not scene.overlaps or scene.joint:  # the views of an edge alone lack surfaces of others
-            return LoadedScene(entry, scene)
+            return _with_facts(entry, scene)
         from pansplat.tours.graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
@@ -188,9 +189,18 @@ def load_entry(
     scene = pipeline.predict(
         entry.pair,
         options=prediction,
-        on_predicted=None if show is None else lambda scene: show(LoadedScene(entry, scene, is_final=False)),
+        on_predicted=None if show is None else lambda scene: show(_with_facts(entry, scene, is_final=False)),
     )
-    return LoadedScene(entry, scene)
+    return _with_facts(entry, scene)
+
+
+def _with_facts(entry: SceneEntry, scene: "Scene", is_final: bool = True) -> LoadedScene:
+    """A scene without a graph, and where surfaces stop its camera."""
+    from pansplat.tours.facts import TourFacts
+
+    facts = TourFacts(scene) if len(scene.cam2world) else None
+    _ = facts and facts.bounds  # computed in this thread
+    return LoadedScene(entry, scene, is_final, facts)
 
 
 def _load_tour_scene(

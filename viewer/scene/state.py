@@ -56,6 +56,8 @@ class ViewerState:
     tour: TourGraph | None = None  # that is shown; None for other scenes
     route: Route | None = None  # the flight through a tour; None if none is planned, and in other scenes
     target: int | None = None  # the panorama of a tour to fly to; None if there is none
+    bounds: TourGraph | None = None  # whose surfaces stop the camera in a scene that is no tour
+    has_stopped: bool = False  # whether they have, and a message has said so
     minimap: bool = True
     hotspots: bool = True
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
@@ -88,7 +90,7 @@ def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR)
     state.context = scene.cam2world.double().numpy()
-    state.tour = state.route = state.target = None
+    state.tour = state.route = state.target = state.bounds = None
     state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
     level = _level_camera(state.camera, level_axes(scene.cam2world))
     camera = move_to_pose(level, _choose_start_pose(scene, state.flight))
@@ -143,6 +145,18 @@ def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
     if settings.mode == "deferred" and (num_views < 2 or scene.joint):
         settings = replace(settings, mode="joint")
     return replace(settings, view=min(settings.view, num_views - 1))
+
+
+def limit_camera(state: ViewerState, before: Camera) -> None:
+    """Stop a camera that walks before surfaces, and say once why."""
+    bounds, camera = state.tour or state.bounds, state.camera
+    if bounds is None or state.orbiting or camera.position == before.position:
+        return
+    place = bounds.limit_step(np.array(before.position), np.array(camera.position))
+    state.camera = replace(camera, position=tuple(place.tolist()))
+    if state.tour is None and not state.has_stopped and not np.allclose(place, camera.position):
+        state.has_stopped = True
+        state.show_message("Surfaces stop the camera: no photograph shows what is behind them   (V: orbit around them)")
 
 
 def jump_to_view(state: ViewerState, view: int) -> None:

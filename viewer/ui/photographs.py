@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.pairs import Note, Panorama
+from pansplat.inputs.photographs import read_notes
 from pansplat.tours.route import STOP_REACH
 
 MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
@@ -31,7 +32,7 @@ class Photographs:
         self._positions: Float[np.ndarray, "photograph 3"] = np.zeros((0, 3))
         self._reading: dict[int, Future[UInt8[np.ndarray, "height width 3"]]] = {}
         self._failed: set[int] = set()
-        self._notes: dict[int, tuple[Note, ...]] = {}  # of panoramas whose notes were changed
+        self._notes: dict[int, tuple[Note, ...]] = {}  # of panoramas that were shown
         self._textures: OrderedDict[int, moderngl.Texture] = OrderedDict()
 
     def __len__(self) -> int:
@@ -72,11 +73,13 @@ class Photographs:
         return index if is_near else None
 
     def list_notes(self, index: int) -> tuple[Note, ...]:
-        """The notes of a photograph."""
-        return self._notes.get(index, self._panoramas[index].notes)
+        """The notes of a photograph, which are read from its links.json when they are first shown."""
+        if index not in self._notes:
+            self._notes[index] = read_notes(self._panoramas[index])
+        return self._notes[index]
 
     def change_notes(self, index: int, notes: tuple[Note, ...]) -> None:
-        """Replace the notes of a photograph until it is read again."""
+        """Replace the notes of a photograph until they are read again."""
         self._notes[index] = notes
 
     def get(self, index: int) -> moderngl.Texture | None:

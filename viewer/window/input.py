@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, toggle_play
+from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, limit_camera, toggle_play
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
@@ -216,11 +216,8 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     if any(events.pan):
         metres = camera.distance / max(events.height, 1)
         camera = cameras.fly(camera, -events.pan[0] * metres, events.pan[1] * metres, 0.0)
-    if state.tour is not None and not state.orbiting and camera.position != state.camera.position:
-        ends = (np.array(each.position) for each in (state.camera, camera))
-        camera = replace(camera, position=tuple(state.tour.limit_step(*ends).tolist()))
-    if camera != state.camera:
+    before, state.camera = state.camera, camera
+    limit_camera(state, before)
+    if replace(state.camera, vertical_fov_degrees=before.vertical_fov_degrees) != before:
         # Moving the camera stops the flight; a change of the field of view alone does not.
-        moved = replace(camera, vertical_fov_degrees=state.camera.vertical_fov_degrees) != state.camera
-        state.playing, state.path_playing = state.playing and not moved, state.path_playing and not moved
-        state.camera = camera
+        state.playing = state.path_playing = False

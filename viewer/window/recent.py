@@ -38,6 +38,7 @@ def read_recent(file: Path | None) -> tuple[str, ...]:
 def add_recent(recent: tuple[str, ...], path: Path, file: Path | None) -> tuple[str, ...]:
     """The paths with one that is opened now, which are written to the file, complete or not at all, if it can be."""
     name = str(path.absolute())
+    recent = read_recent(file) or recent  # another window may have opened others since
     recent = (name, *(other for other in recent if other != name))[:_MAX_RECENT]
     with suppress(InputError, OSError):
         if file is not None:

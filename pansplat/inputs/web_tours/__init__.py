@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pansplat.errors import InputError
+from pansplat.images.blur_masks import locate_panorama
 from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.inputs.pairs import Collection
 from pansplat.inputs.web_tours.entries import make_panoramas
@@ -32,7 +33,8 @@ def is_web_tour_file(file: Path) -> bool:
 
 def is_scene_of_tour(folder: Path, image: Path) -> bool:
     """Whether a panorama is a scene of the web tour in a folder that is made from cube faces."""
-    return image.name.endswith(CUBE_SUFFIX) and bool(find_web_tours(folder))
+    tours = find_web_tours(folder) if image.name.endswith(CUBE_SUFFIX) else []
+    return any(source.parent.resolve() == locate_panorama(image).parent for source in tours)
 
 
 def read_web_tour(source: Path, folder: Path, convention: str | None = None) -> Collection:

@@ -13,9 +13,10 @@ from PIL import Image
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.ply import save_ply
+from pansplat.geometry.world import WorldFrame
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, load_entry
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings
 from pansplat_viewer.scene.tour import TourScenes
@@ -55,6 +56,11 @@ def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):
     assert [entry.name for entry in entries] == ["a", "b"]
     loaded = load_entry(entries[0], PredictOptions())
     assert len(loaded.scene.gaussians) == len(small_scene.gaussians)
+    assert [entry.notes for entry in entries] == [(), ()]
+    (tmp_path / "hall.jpg").write_bytes(b"half a photograph")
+    with pytest.warns(InputWarning, match=r"the photographs are left out: .*hall\.jpg"):
+        entries = find_entries(tmp_path, ReadOptions(), PredictOptions())
+    assert [entry.name for entry in entries] == ["a", "b"] and all("hall.jpg" in entry.notes[0] for entry in entries)
 
 
 def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_file):
@@ -69,6 +75,13 @@ def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_fil
     assert other.entry.views == (2, 3) and scenes.loaded == [(0, 1), (1, 2), (2, 3)]
     assert other.scene.gaussians.views.unique().tolist() == [0, 1]
     assert np.allclose(other.scene.cam2world, house.cam2world[2:])
+
+
+def test_photographs_are_placed_by_camera_heights_in_the_unit_of_their_files(house):
+    tour = replace(house, panoramas=tuple(view.in_frame(WorldFrame(1000.0)) for view in house.panoramas))
+    views = list_panoramas([SceneEntry("house", tour=tour)], house.folder)
+    assert {view.camera_height for view in views} == {1500.0}
+    assert [view.cam2world.tolist() for view in views] == [view.cam2world.tolist() for view in house.panoramas]
 
 
 def test_warnings_about_the_input_are_notes_of_its_entries(monkeypatch, house):

@@ -18,6 +18,12 @@ def test_paths_are_read_back_and_the_folder_is_made(tmp_path):
         assert read_recent(file) == (), "a damaged file"
 
 
+def test_paths_that_another_window_has_opened_stay(tmp_path):
+    for name in ("/a", "/b"):
+        add_recent((), Path(name), tmp_path / "viewer.json")
+    assert [Path(path).name for path in read_recent(tmp_path / "viewer.json")] == ["b", "a"]
+
+
 def test_a_folder_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert find_file() == tmp_path / "pansplat" / "viewer.json"
