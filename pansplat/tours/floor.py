@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
+from pansplat.tours.surfaces import sample_surfaces, split_by_azimuth
 
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
 _AZIMUTHS = 180  # of a floor outline
@@ -43,7 +43,7 @@ def find_camera_height(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
         view: index of the view.
         level: right, down and forward (columns) of a level camera.
     """
-    return _find_floor(locate_surfaces(scene, view, level))
+    return _find_floor(sample_surfaces(scene, view, level))
 
 
 def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
@@ -87,7 +87,7 @@ def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
     Args:
         scene, view, level: see `find_camera_height`.
     """
-    found = trace_floor(locate_surfaces(scene, view, level))
+    found = trace_floor(sample_surfaces(scene, view, level))
     if found is None:
         return None
     corners, height = found

@@ -25,7 +25,7 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
 from pansplat.tours.floor import assign_storeys, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
+from pansplat.tours.surfaces import sample_surfaces, split_by_azimuth
 
 _RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
@@ -42,6 +42,7 @@ _OBLIQUE, _OBLIQUE_SHARE = math.radians(12), 0.15  # least angle to the main dir
 _CLUSTER, _LEAST_WALL, _MOST_LINES = 0.07, 0.2, 24  # half width of a line's chords, its length, lines of a direction
 _DISTANCE_NOISE, _LARGEST_ERROR = 0.07, 0.35  # of the distance of a wall
 _CORNER, _JUMP, _LARGEST_JUMP = 5.0, 0.15, 5.0  # costs of another wall, in errors of one ray; of a jump in depth
+_NEVER = 1e4  # cost of a wall in a direction in which it is not
 _NARROW, _COLLINEAR = 0.12, 0.02  # half width of spikes that are left out; merged pieces of walls
 _LEAST_AREA = 0.4  # of a room, squared camera heights
 _BEYOND = 0.25  # of the floor behind an opening
@@ -198,7 +199,7 @@ def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
 
 def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: float) -> _Sight | None:
     """What a panorama shows; None if it shows no walls."""
-    places = locate_surfaces(scene, view, level)
+    places = sample_surfaces(scene, view, level)
     center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
     down, flat = places[:, 1], places[:, (0, 2)]
     low = flat[(down > _LOW[0] * height) & (down < _LOW[1] * height)]
@@ -373,15 +374,19 @@ def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | Non
             distance = offsets / (rays @ lines.normals.T)
         return np.where(distance > 0, distance, np.inf)
 
-    error = np.abs(meet(_rays()) - measured[:, None]) / unit
+    reached = meet(_rays())
+    error = np.abs(reached - measured[:, None]) / unit
     costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _DISTANCE_NOISE
+    costs[np.isinf(reached)] = _NEVER
     angles = np.arange(_RAYS) * 2 * math.pi / _RAYS
-    between = np.minimum(meet(np.stack((np.sin(angles), np.cos(angles)), axis=1)), 1e3 * unit)
+    between = meet(np.stack((np.sin(angles), np.cos(angles)), axis=1))
+    beyond = np.where(np.isinf(between), _NEVER, 0.0)  # a wall ends where a ray meets it
+    between = np.minimum(between, 1e3 * unit)
     total, origins = costs[0], []
     for step in range(1, 3 * _RAYS):
         ray = step % _RAYS
         jump = np.abs(between[ray][:, None] - between[ray]) / (_JUMP * unit)
-        change = _CORNER + np.minimum(jump, _LARGEST_JUMP)
+        change = _CORNER + np.minimum(jump, _LARGEST_JUMP) + beyond[ray] + beyond[ray][:, None]
         np.fill_diagonal(change, 0)
         reached = total[:, None] + change  # from each line to each line
         origins.append(reached.argmin(axis=0))

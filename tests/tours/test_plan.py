@@ -15,7 +15,7 @@ from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.export.plan_files import _Drawing, describe_plan, write_plan
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
@@ -196,6 +196,39 @@ def test_a_corridor_whose_end_is_no_wall_ends_at_the_farthest_surface() -> None:
     assert outline is not None
     assert outline.bounds[:3] == pytest.approx((left, behind, right), abs=1e-6)
     assert 4.3 < outline.bounds[3] < 4.3 + 0.35 * 1.5, "the right wall meets the first ray of the corridor after 8 m"
+
+
+def test_a_room_stays_closed_where_no_wall_explains_what_is_seen_at_a_corner() -> None:
+    """Beyond the corner a sixth of the horizon looks into another room, which ends in a line with a wall ahead."""
+    normals, offsets = ((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0)), (1.6, 1.24, -1.74, -1.6, 0.6)
+    lines = _Lines(np.array(normals), np.array(offsets))
+    reach = lines.offsets / (_rays() @ lines.normals.T)
+    reach = np.where(reach > 0, reach, np.inf)
+    seen = reach[:, :4].min(axis=1)
+    seen[230:282], seen[282:288] = 4.0, reach[282:288, 4]
+    walls = seen[:, None] * _rays()
+    outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
+    assert outline is not None
+    assert outline.bounds == pytest.approx((-1.74, -1.6, 1.6, 1.24)) and outline.area == pytest.approx(3.34 * 2.84)
+
+
+def test_rooms_do_not_depend_on_how_many_gaussians_show_a_surface() -> None:
+    """A row of books before a wall, which a third of each ray below the ceiling meets, has the most detail."""
+    plain = _make_house(WALLS, CAMERAS)
+    means, labels = plain.gaussians.means, plain.gaussians.views
+    place = torch.stack([plain.cam2world[k, :3, 3] for k in range(3)]).to(means)[labels.long()]
+    offset = means - place
+    height, angle = -offset[:, 1] / (_CEILING - CAMERA_HEIGHT), torch.atan2(offset[:, 0], offset[:, 2])
+    is_book = (height > 0.6) & (height < 0.68) & (angle.abs() < 0.6)
+    moved = torch.where(is_book[:, None], place + 0.6 * offset, means)
+    moved[is_book, 1] = means[is_book, 1]
+    shelf = dataclasses.replace(plain, gaussians=dataclasses.replace(plain.gaussians, means=moved))
+    books = shelf.gaussians.select(is_book)
+    detailed = dataclasses.replace(shelf, gaussians=Gaussians.cat([shelf.gaussians, *[books] * 15]))
+    few, many = _plan(shelf), _plan(detailed)
+    assert [room.panoramas for room in few.rooms] == [room.panoramas for room in many.rooms] == [(0, 1), (2,)]
+    for room, other in zip(few.rooms, many.rooms, strict=True):
+        assert other.outline == pytest.approx(room.outline, abs=0.02)
 
 
 def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
