@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -355,10 +355,9 @@ def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
 
 
 def _choose_piece(shape: shapely.Geometry, center: Float[np.ndarray, "2"]) -> Polygon | None:
-    """The polygon of a shape that is at a camera; None without one."""
-    pieces = [piece for piece in shapely.get_parts(shape) if isinstance(piece, Polygon) and piece.area > 0]
-    place = shapely.Point(center)
-    return min(pieces, key=lambda piece: piece.distance(place), default=None)
+    """The polygon of a shape that a camera is in; None without one."""
+    pieces = [piece for piece in shapely.get_parts(shape) if isinstance(piece, Polygon)]
+    return next((piece for piece in pieces if piece.contains(shapely.Point(center))), None)
 
 
 def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | None:
@@ -453,15 +452,22 @@ def _outline_rooms(
         lines = _find_lines([seen[k] for k in nodes], normals, unit)
         outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]
         shapes.append((nodes, _clean(shapely.union_all(outlines), unit)))
-    rooms, free = [], set(members) - set(traced)
-    for nodes, shape in _separate(shapes, seen):
-        piece = _choose_piece(_clean(shape, unit), seen[nodes[0]].center)
-        if piece is not None and piece.area > _LEAST_AREA * unit**2:
-            ring = shapely.normalize(piece).exterior
-            corners = np.array((ring if ring.is_ccw else ring.reverse()).coords)[:-1]
-            guests = tuple(sorted(k for k in free if piece.contains(shapely.Point(seen[k].center))))
-            rooms.append((nodes + guests, corners))
+    pieces = [
+        (nodes, piece) for nodes, shape in _separate(shapes, seen) for piece in shapely.get_parts(_clean(shape, unit))
+    ]
+    pieces = [(_list_inside(nodes, seen, piece), piece) for nodes, piece in pieces]
+    pieces = [(nodes, piece) for nodes, piece in pieces if nodes and piece.area > _LEAST_AREA * unit**2]
+    free, rooms = set(members) - {node for nodes, _ in pieces for node in nodes}, []
+    for nodes, piece in pieces:
+        ring = shapely.normalize(piece).exterior
+        corners = np.array((ring if ring.is_ccw else ring.reverse()).coords)[:-1]
+        rooms.append((nodes + _list_inside(sorted(free), seen, piece), corners))
     return rooms
+
+
+def _list_inside(nodes: Iterable[int], sights: dict[int, _Sight], shape: shapely.Geometry) -> tuple[int, ...]:
+    """The panoramas whose cameras are in a shape."""
+    return tuple(node for node in nodes if shape.contains(shapely.Point(sights[node].center)))
 
 
 def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
@@ -483,7 +489,8 @@ def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
 def _separate(
     shapes: Sequence[tuple[tuple[int, ...], shapely.Geometry]], sights: dict[int, _Sight]
 ) -> list[tuple[tuple[int, ...], shapely.Geometry]]:
-    """The rooms without the places that belong to other ones: those of the room with the nearest camera."""
+    """The rooms without the places that belong to other ones: those of the room with most cameras there, or the nearest
+    one."""
     result = [shape for _, shape in shapes]
     centers = [shapely.MultiPoint([sights[node].center for node in nodes]) for nodes, _ in shapes]
     for a, b in itertools.combinations(range(len(shapes)), 2):
@@ -492,7 +499,8 @@ def _separate(
             if piece.area == 0:
                 continue
             place = piece.representative_point()
-            loser = b if centers[a].distance(place) < centers[b].distance(place) else a
+            rank = {k: (len(_list_inside(shapes[k][0], sights, piece)), -centers[k].distance(place)) for k in (a, b)}
+            loser = min(b, a, key=lambda k: rank[k])
             result[loser] = result[loser].difference(piece)
     return [(nodes, shape) for (nodes, _), shape in zip(shapes, result, strict=True)]
 

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+import shapely
 import torch
 from synthetic_scenes import make_balls
 
@@ -19,8 +20,9 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
+from pansplat.tours import plan as plan_module
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.plan import Plan, _Lines, _rays, _Sight, _trace_outline
+from pansplat.tours.plan import Plan, _Lines, _rays, _separate, _Sight, _trace_outline
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -229,6 +231,24 @@ def test_rooms_do_not_depend_on_how_many_gaussians_show_a_surface() -> None:
     assert [room.panoramas for room in few.rooms] == [room.panoramas for room in many.rooms] == [(0, 1), (2,)]
     for room, other in zip(few.rooms, many.rooms, strict=True):
         assert other.outline == pytest.approx(room.outline, abs=0.02)
+
+
+def test_a_place_that_two_rooms_have_in_common_belongs_to_the_one_whose_camera_is_there() -> None:
+    """The middle of the corridor is nearer to the camera of the other room."""
+    places = np.empty((0, 2))
+    sights = {k: _Sight(np.array(center), places, places, places) for k, center in enumerate(((1.0, 0.5), (5.0, 1.5)))}
+    shapes = [((0,), shapely.box(0, 0, 10, 1)), ((1,), shapely.box(0, 0, 10, 4))]
+    first, second = (shape for _, shape in _separate(shapes, sights))
+    assert first.equals(shapely.box(0, 0, 10, 1)) and second.equals(shapely.box(0, 1, 10, 4))
+
+
+def test_each_camera_of_a_room_is_in_its_outline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another room takes the place of the second camera."""
+    taken = shapely.box(-1, 4, 4, 7)
+    monkeypatch.setattr(plan_module, "_separate", lambda shapes, _: [(n, shape - taken) for n, shape in shapes])
+    plan = _plan(_make_house(WALLS, CAMERAS))
+    assert [room.panoramas for room in plan.rooms] == [(0,), (2,)]
+    assert any(line.startswith("no closed walls around panorama 2") for line in describe_plan(plan))
 
 
 def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
