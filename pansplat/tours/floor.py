@@ -19,7 +19,6 @@ _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
 _AZIMUTHS = 180  # of a floor outline
 _NECK = 0.3  # half of the width of a door, of the camera's height; narrower floors are none
 _LEAST_FULL = 0.65  # of the convex hull of a floor; rays through several wide openings have 0.5 to 0.64
-_STEPS = 65  # at which a ray is tested
 _STOREY_GAP, _STOREY_REACH = 1.2, 0.4  # metres: least distance of the cameras of two storeys; from a storey's level
 
 
@@ -129,11 +128,10 @@ def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "az
 
 def _close_doors(corners: Float[np.ndarray, "azimuth 2"], neck: float) -> Float[np.ndarray, "azimuth 2"]:
     """An outline around the origin that ends where it is narrower than twice the neck."""
-    origin = shapely.Point(0, 0)
     pieces = shapely.get_parts(Polygon(corners).buffer(-neck))
-    piece = min(pieces, key=lambda piece: piece.distance(origin), default=Polygon())
+    piece = min(pieces, key=lambda piece: piece.distance(shapely.Point(0, 0)), default=Polygon())
     shape = piece.buffer(neck, join_style="mitre", mitre_limit=1.5)
-    along = np.linspace(0, 1, _STEPS)
+    along = np.linspace(0, 1, 65)
     is_inside = shapely.contains_xy(shape, *(corners.T[..., None] * along))
     return corners * (np.logical_and.accumulate(is_inside, axis=1).mean(axis=1))[:, None]
 

@@ -342,8 +342,8 @@ def _trace_outline(sight: _Sight, lines: _Lines, unit: float) -> Polygon | None:
     low, high = (find(sight.walls @ axes.T, axis=0) for find in (np.nanmin, np.nanmax))
     margin = _LARGEST_ERROR * unit
     outline = np.clip(outline @ axes.T, low - margin, high + margin) @ axes
-    polygon = shapely.make_valid(Polygon(sight.center + outline))
-    return _choose_piece(polygon.buffer(0), sight.center)
+    pieces = shapely.get_parts(shapely.make_valid(Polygon(sight.center + outline)).buffer(0))
+    return next((piece for piece in pieces if piece.contains(shapely.Point(sight.center))), None)
 
 
 def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
@@ -352,12 +352,6 @@ def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
     length = np.linalg.norm(sides, axis=1)
     away = np.abs(sides @ lines.normals.T).min(axis=1)
     return not ((length > _LEAST_WALL * unit) & (away > math.sin(_SKEW) * length)).any()
-
-
-def _choose_piece(shape: shapely.Geometry, center: Float[np.ndarray, "2"]) -> Polygon | None:
-    """The polygon of a shape that a camera is in; None without one."""
-    pieces = [piece for piece in shapely.get_parts(shape) if isinstance(piece, Polygon)]
-    return next((piece for piece in pieces if piece.contains(shapely.Point(center))), None)
 
 
 def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | None:

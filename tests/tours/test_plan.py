@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
-import shapely
+import shapely.affinity
 import torch
 from synthetic_scenes import make_balls
 
@@ -308,6 +308,30 @@ def test_a_room_at_an_approximate_place_is_dashed_where_its_neighbour_has_it(tmp
     text, known = (tmp_path / "plan.svg").read_text(), _plan(scene).rooms
     assert [room.is_placed for room in known] == [True, False] and "stroke-dasharray" in text
     assert _read_svg(tmp_path / "plan.svg")[1].count("about here") == 1
+
+
+def test_texts_are_neither_on_walls_nor_on_dots_nor_on_one_another() -> None:
+    """The hall is at an approximate place over the corner of the L, and a camera without walls is beside a wall."""
+    names = ("Living room", "Living room", "Hall", "Closet")
+    house = _make_house(WALLS, [*CAMERAS, (5.0, 4.2)], names=names)
+    scene = dataclasses.replace(
+        house,
+        gaussians=house.gaussians.select(house.gaussians.views < 3),
+        overlaps=((0, 1, 0.5), (1, 3, 0.5), (2, 2, 1.0)),
+        approximate=((2, 0, 1.6, 0.4, 0.0),),
+    )
+    drawing = _Drawing(_plan(scene))
+    assert [room.panoramas for room in drawing.plan.rooms] == [(0, 1), (2,)]
+    walls = shapely.union_all([shapely.Polygon(drawing.outline(room)).exterior for room in drawing.plan.rooms])
+    covers = []
+    for text in drawing.list_texts():
+        width, (x, y) = 0.7 * text.size * len(text.text), text.place
+        left = x - width / 2 if text.is_centred else x
+        box = shapely.box(left, y - text.size / 2, left + width, y + text.size / 2)
+        covers.append(shapely.affinity.rotate(box, text.angle))
+        assert not covers[-1].intersects(walls), text
+        assert min(covers[-1].distance(shapely.Point(dot)) for dot in drawing.panoramas) > 0.06, text
+    assert len(covers) > 8 and shapely.union_all(covers).area == pytest.approx(sum(c.area for c in covers))
 
 
 def test_the_picture_is_the_drawing(tmp_path: Path) -> None:
