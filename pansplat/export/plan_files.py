@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 from jaxtyping import Float
-from shapely.geometry import Polygon
+from shapely import affinity
+from shapely.geometry import LineString, Polygon
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
@@ -52,6 +52,13 @@ class _Text:
     size: float
     is_centred: bool = True
     angle: float = 0.0
+
+    @property
+    def cover(self) -> Polygon:
+        """What a text around its place covers."""
+        width = _LETTER * self.size * len(self.text)
+        box = shapely.box(-width / 2, -self.size / 2, width / 2, self.size / 2)
+        return affinity.translate(affinity.rotate(box, self.angle), *self.place)
 
 
 def write_plan(scene: Scene, path: str | Path) -> Plan:
@@ -193,33 +200,46 @@ class _Drawing:
         """Lines below the plan."""
         return describe_plan(self.plan)
 
-    def list_texts(self) -> Iterator[_Text]:
-        """Names and areas of rooms, lengths of walls, and the names of panoramas outside of rooms."""
-        for room in self.plan.rooms:
-            corners = self.outline(room)
-            free = Polygon(corners).buffer(-2 * _SMALL_TEXT)  # of lengths, and of the dots of panoramas
-            free -= shapely.MultiPoint(self.panoramas[list(room.panoramas)]).buffer(_SMALL_TEXT)
-            circle = shapely.maximum_inscribed_circle(Polygon(corners) if free.is_empty else free)
-            (x, y), width = circle.coords[0], 2 * circle.length
+    def list_texts(self) -> list[_Text]:
+        """Names and areas of rooms, names of panoramas outside of rooms, and lengths of walls where there is space."""
+        outlines = {room: self.outline(room) for room in self.plan.rooms}
+        walls = shapely.union_all([Polygon(corners).exterior for corners in outlines.values()])
+        taken, texts = shapely.MultiPoint(self.panoramas).buffer(_SMALL_TEXT), list[_Text]()
+
+        def add(*options: _Text) -> None:
+            nonlocal taken
+            texts.append(next((text for text in options if not text.cover.intersects(walls | taken)), options[0]))
+            taken |= texts[-1].cover
+
+        for room, corners in outlines.items():
+            shape, others = Polygon(corners), np.delete(self.panoramas, room.panoramas, axis=0)
+            free = shape.buffer(-2 * _SMALL_TEXT) - walls.buffer(_SMALL_TEXT) - taken
+            free -= shapely.MultiPoint(others).buffer(6 * _SMALL_TEXT)
+            circle = shapely.maximum_inscribed_circle(shape if free.is_empty else free)
+            (x, y), radius = circle.coords[0], circle.length
             area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
             about = [(-2.1, "about here")] if room.panoramas[0] in self.plan.tour.approximate else []
             for row, text in [(0.7, room.name), (-0.7, f"{area} m² ± {error}"), *about]:
-                size = min(_TEXT, 0.9 * width / (_LETTER * max(len(text), 1)))
-                yield _Text("ROOMS", (x, y + row * size), text, size)
-            for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                length = float(np.linalg.norm(end - start))
-                if length >= _MEASURED:
-                    x, y = (start + end) / 2 + 1.2 * _SMALL_TEXT * np.array((start - end)[::-1]) * (1, -1) / length
-                    angle = math.degrees(
-                        math.remainder(math.atan2(*(end - start)[::-1]) - _UPWARDS, math.pi) + _UPWARDS
-                    )
-                    text = _format_number(self.plan, length, 2)
-                    yield _Text("LENGTHS", (x, y), text, _SMALL_TEXT, angle=angle)
+                size = min(_TEXT, 0.9 * radius / math.hypot(_LETTER * len(text) / 2, abs(row) + 0.5))
+                add(_Text("ROOMS", (x, y + row * size), text, size))
         inside = {node for room in self.plan.rooms for node in room.panoramas}
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
                 name = self.plan.tour.panoramas[node].label
-                yield _Text("PANORAMAS", (x + 0.12, y), name, _SMALL_TEXT, is_centred=False)
+                away = 1.5 * _SMALL_TEXT + _LETTER * _SMALL_TEXT * len(name) / 2
+                places = (x + away, y), (x - away, y), (x, y + 2 * _SMALL_TEXT), (x, y - 2 * _SMALL_TEXT)
+                options = [_Text("PANORAMAS", place, name, _SMALL_TEXT) for place in places]
+                add(*sorted(options, key=lambda text: LineString(((x, y), text.place)).intersects(walls)))
+        for room, corners in outlines.items():
+            above = [Polygon(c) for r, c in outlines.items() if r is not room and r.is_placed >= room.is_placed]
+            for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                length = float(np.linalg.norm(end - start))
+                x, y = (start + end) / 2 + 1.2 * _SMALL_TEXT * np.array((start - end)[::-1]) * (1, -1) / length
+                angle = math.degrees(math.remainder(math.atan2(*(end - start)[::-1]) - _UPWARDS, math.pi) + _UPWARDS)
+                text = _Text("LENGTHS", (x, y), _format_number(self.plan, length, 2), _SMALL_TEXT, angle=angle)
+                if length >= _MEASURED and not text.cover.intersects(walls | taken | shapely.union_all(above)):
+                    add(text)
+        return texts
 
 
 def _place_notes(notes: list[str]) -> list[_Text]:
@@ -244,13 +264,15 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     def points(metres: float) -> float:
         return metres * _PAPER / _POINT
 
-    for room in sorted(drawing.plan.rooms, key=lambda room: room.is_placed):  # what is sure is on top
+    for room in drawing.plan.rooms:
         dashes = "solid" if room.is_placed else "dashed"
         style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes, "linewidth": points(0.07)}
-        axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", **style)
-    for ends in drawing.doors:
-        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt")
-        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt")
+        above = 2 * room.is_placed - 4  # what is sure is on top
+        axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", zorder=above, **style)
+    for ends, door in zip(drawing.doors, drawing.plan.doors, strict=True):
+        above = 2 * drawing.plan.rooms[door.rooms[0]].is_placed - 3
+        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt", zorder=above)
+        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt", zorder=above)
     axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12), markeredgewidth=0)
     for text in [*drawing.list_texts(), *_place_notes(notes)]:
         axes.text(

@@ -21,7 +21,7 @@ from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
 from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.web_tours import find_web_tours, is_web_tour_file
 from pansplat.system.descriptions import list_first
-from pansplat.system.files import expand_home, is_scene_file, is_written, require_text
+from pansplat.system.files import expand_home, is_scene_file, is_written, make_unique_name, require_text
 from pansplat.system.options import CAMERA_HEIGHT
 
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
@@ -368,5 +368,5 @@ def make_names_unique(pairs: list[Pair]) -> list[Pair]:
     counts, seen = Counter(names), Counter()
     for i, name in enumerate(names):
         seen[name] += 1
-        names[i] = name if counts[name] == 1 else f"{name}_{seen[name]}"
+        names[i] = name if counts[name] == 1 else make_unique_name(f"{name}_{seen[name]}", names)
     return [dataclasses.replace(pair, name=name) for pair, name in zip(pairs, names, strict=True)]

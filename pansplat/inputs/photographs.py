@@ -29,7 +29,7 @@ from pansplat.inputs.web_tours.entries import (
 )
 from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import list_first
-from pansplat.system.files import is_written
+from pansplat.system.files import is_written, make_unique_name
 from pansplat.system.strict_json import convert, read_field, read_json
 
 LINKS = "links.json"
@@ -140,7 +140,7 @@ def _read_pictures(images: Sequence[Path], folder: Path) -> tuple[list[Panorama]
         name = image.stem if repeated[image.stem] == 1 and image.stem not in cubes else image.name.replace(".", "_")
         try:
             require_panorama(image)
-            pictures[name] = image
+            pictures[make_unique_name(name, pictures)] = image
         except InputError as error:
             problems.append(str(error))
     return [make_panorama(name, pictures[name], folder) for name in sorted(pictures)], problems

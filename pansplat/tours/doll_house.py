@@ -14,7 +14,7 @@ from shapely.geometry import Polygon
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys, choose_camera_height, find_ceiling
 from pansplat.tours.plan import Plan
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.surfaces import sample_surfaces
 
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
 _WALL = 0.15  # how far behind the outline of a room its walls are, in heights of the camera
@@ -63,7 +63,7 @@ def find_rooms(facts: TourFacts) -> Rooms:
     gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
     scene = dataclasses.replace(scene, gaussians=gaussians)
     unit = choose_camera_height(facts.heights, scene.far)
-    ceilings = [find_ceiling(locate_surfaces(scene, view, level)) for view in range(count)]
+    ceilings = [find_ceiling(sample_surfaces(scene, view, level)) for view in range(count)]
     outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
     shapes = [outline.buffer(_WALL * unit, join_style="mitre") for _, outline in outlines]
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
@@ -85,7 +85,7 @@ def find_rooms(facts: TourFacts) -> Rooms:
             piece = max(shapely.get_parts(free), key=lambda piece: piece.area, default=None)
             if isinstance(piece, Polygon) and piece.area > _LEAST_AREA * unit**2:
                 outlines.append(((view,), shapely.orient_polygons(piece)))
-        elif len(places := locate_surfaces(scene, view, level)):
+        elif len(places := sample_surfaces(scene, view, level)):
             reach = float(np.quantile(np.hypot(places[:, 0], places[:, 2]), _SHOWN))
             shapes.append(shapely.Point(tour.positions[view] @ level[:, (0, 2)]).buffer(reach))
     houses = []

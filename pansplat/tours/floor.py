@@ -7,14 +7,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from jaxtyping import Float
+from shapely.geometry import Polygon
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
+from pansplat.tours.surfaces import sample_surfaces, split_by_azimuth
 
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
 _AZIMUTHS = 180  # of a floor outline
+_NECK = 0.3  # half of the width of a door, of the camera's height; narrower floors are none
+_LEAST_FULL = 0.65  # of the convex hull of a floor; rays through several wide openings have 0.5 to 0.64
 _STOREY_GAP, _STOREY_REACH = 1.2, 0.4  # metres: least distance of the cameras of two storeys; from a storey's level
 
 
@@ -43,7 +47,7 @@ def find_camera_height(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
         view: index of the view.
         level: right, down and forward (columns) of a level camera.
     """
-    return _find_floor(locate_surfaces(scene, view, level))
+    return _find_floor(sample_surfaces(scene, view, level))
 
 
 def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
@@ -87,7 +91,7 @@ def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
     Args:
         scene, view, level: see `find_camera_height`.
     """
-    found = trace_floor(locate_surfaces(scene, view, level))
+    found = trace_floor(sample_surfaces(scene, view, level))
     if found is None:
         return None
     corners, height = found
@@ -96,7 +100,9 @@ def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"])
 
 
 def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "azimuth 2"], float] | None:
-    """Where the floor ends around a camera (right, forward), and its height over it; None if places show no floor.
+    """Where the floor ends around a camera (right, forward), and its height over it.
+
+    It ends at doors. None if places show no floor, or one that still goes on in rays, through wide openings.
 
     Args:
         places: of surfaces relative to the camera (right, down, forward), in any unit.
@@ -115,7 +121,19 @@ def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "az
     neighbours = np.stack([np.roll(reach, shift) for shift in range(-2, 3)])
     reach = np.median(neighbours, axis=0)  # without single outliers
     angles = (np.arange(_AZIMUTHS) + 0.5) * 2 * math.pi / _AZIMUTHS
-    return reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1), height
+    corners = _close_doors(reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1), _NECK * height)
+    shape = Polygon(corners)
+    return (corners, height) if shape.area > _LEAST_FULL * shape.convex_hull.area else None
+
+
+def _close_doors(corners: Float[np.ndarray, "azimuth 2"], neck: float) -> Float[np.ndarray, "azimuth 2"]:
+    """An outline around the origin that ends where it is narrower than twice the neck."""
+    pieces = shapely.get_parts(Polygon(corners).buffer(-neck))
+    piece = min(pieces, key=lambda piece: piece.distance(shapely.Point(0, 0)), default=Polygon())
+    shape = piece.buffer(neck, join_style="mitre", mitre_limit=1.5)
+    along = np.linspace(0, 1, 65)
+    is_inside = shapely.contains_xy(shape, *(corners.T[..., None] * along))
+    return corners * (np.logical_and.accumulate(is_inside, axis=1).mean(axis=1))[:, None]
 
 
 def _measure_reach(places: Float[np.ndarray, "n 3"], quantile: float) -> Float[np.ndarray, "azimuth"]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -727,8 +726,7 @@ def make_graph(scene: Scene) -> TourGraph:
     """The graph of a scene's cameras, with the edges and links that `merge_scenes` has kept in the scene."""
     count = len(scene.cam2world)
     titles = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(count)]
-    counts = Counter(titles)
-    names = [title if counts[title] == 1 else f"{title} ({k + 1})" for k, title in enumerate(titles)]
+    names = [f"{title} ({k + 1})" for k, title in enumerate(titles)]  # no two are equal, whatever the titles are
     links: list[list[Link]] = [[] for _ in range(count)]
     for start, end, yaw, pitch, text in scene.links:
         links[start].append(Link(names[end], yaw, pitch, text))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
 from pansplat.tours.floor import assign_storeys, find_ceiling, trace_floor
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import locate_surfaces, split_by_azimuth
+from pansplat.tours.surfaces import sample_surfaces, split_by_azimuth
 
 _RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
@@ -42,6 +42,7 @@ _OBLIQUE, _OBLIQUE_SHARE = math.radians(12), 0.15  # least angle to the main dir
 _CLUSTER, _LEAST_WALL, _MOST_LINES = 0.07, 0.2, 24  # half width of a line's chords, its length, lines of a direction
 _DISTANCE_NOISE, _LARGEST_ERROR = 0.07, 0.35  # of the distance of a wall
 _CORNER, _JUMP, _LARGEST_JUMP = 5.0, 0.15, 5.0  # costs of another wall, in errors of one ray; of a jump in depth
+_NEVER = 1e4  # cost of a wall in a direction in which it is not
 _NARROW, _COLLINEAR = 0.12, 0.02  # half width of spikes that are left out; merged pieces of walls
 _LEAST_AREA = 0.4  # of a room, squared camera heights
 _BEYOND = 0.25  # of the floor behind an opening
@@ -198,7 +199,7 @@ def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
 
 def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: float) -> _Sight | None:
     """What a panorama shows; None if it shows no walls."""
-    places = locate_surfaces(scene, view, level)
+    places = sample_surfaces(scene, view, level)
     center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
     down, flat = places[:, 1], places[:, (0, 2)]
     low = flat[(down > _LOW[0] * height) & (down < _LOW[1] * height)]
@@ -341,8 +342,8 @@ def _trace_outline(sight: _Sight, lines: _Lines, unit: float) -> Polygon | None:
     low, high = (find(sight.walls @ axes.T, axis=0) for find in (np.nanmin, np.nanmax))
     margin = _LARGEST_ERROR * unit
     outline = np.clip(outline @ axes.T, low - margin, high + margin) @ axes
-    polygon = shapely.make_valid(Polygon(sight.center + outline))
-    return _choose_piece(polygon.buffer(0), sight.center)
+    pieces = shapely.get_parts(shapely.make_valid(Polygon(sight.center + outline)).buffer(0))
+    return next((piece for piece in pieces if piece.contains(shapely.Point(sight.center))), None)
 
 
 def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
@@ -351,13 +352,6 @@ def _is_along(outline: Outline, lines: _Lines, unit: float) -> bool:
     length = np.linalg.norm(sides, axis=1)
     away = np.abs(sides @ lines.normals.T).min(axis=1)
     return not ((length > _LEAST_WALL * unit) & (away > math.sin(_SKEW) * length)).any()
-
-
-def _choose_piece(shape: shapely.Geometry, center: Float[np.ndarray, "2"]) -> Polygon | None:
-    """The polygon of a shape that is at a camera; None without one."""
-    pieces = [piece for piece in shapely.get_parts(shape) if isinstance(piece, Polygon) and piece.area > 0]
-    place = shapely.Point(center)
-    return min(pieces, key=lambda piece: piece.distance(place), default=None)
 
 
 def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | None:
@@ -373,15 +367,19 @@ def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | Non
             distance = offsets / (rays @ lines.normals.T)
         return np.where(distance > 0, distance, np.inf)
 
-    error = np.abs(meet(_rays()) - measured[:, None]) / unit
+    reached = meet(_rays())
+    error = np.abs(reached - measured[:, None]) / unit
     costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _DISTANCE_NOISE
+    costs[np.isinf(reached)] = _NEVER
     angles = np.arange(_RAYS) * 2 * math.pi / _RAYS
-    between = np.minimum(meet(np.stack((np.sin(angles), np.cos(angles)), axis=1)), 1e3 * unit)
+    between = meet(np.stack((np.sin(angles), np.cos(angles)), axis=1))
+    beyond = np.where(np.isinf(between), _NEVER, 0.0)  # a wall ends where a ray meets it
+    between = np.minimum(between, 1e3 * unit)
     total, origins = costs[0], []
     for step in range(1, 3 * _RAYS):
         ray = step % _RAYS
         jump = np.abs(between[ray][:, None] - between[ray]) / (_JUMP * unit)
-        change = _CORNER + np.minimum(jump, _LARGEST_JUMP)
+        change = _CORNER + np.minimum(jump, _LARGEST_JUMP) + beyond[ray] + beyond[ray][:, None]
         np.fill_diagonal(change, 0)
         reached = total[:, None] + change  # from each line to each line
         origins.append(reached.argmin(axis=0))
@@ -448,15 +446,22 @@ def _outline_rooms(
         lines = _find_lines([seen[k] for k in nodes], normals, unit)
         outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]
         shapes.append((nodes, _clean(shapely.union_all(outlines), unit)))
-    rooms, free = [], set(members) - set(traced)
-    for nodes, shape in _separate(shapes, seen):
-        piece = _choose_piece(_clean(shape, unit), seen[nodes[0]].center)
-        if piece is not None and piece.area > _LEAST_AREA * unit**2:
-            ring = shapely.normalize(piece).exterior
-            corners = np.array((ring if ring.is_ccw else ring.reverse()).coords)[:-1]
-            guests = tuple(sorted(k for k in free if piece.contains(shapely.Point(seen[k].center))))
-            rooms.append((nodes + guests, corners))
+    pieces = [
+        (nodes, piece) for nodes, shape in _separate(shapes, seen) for piece in shapely.get_parts(_clean(shape, unit))
+    ]
+    pieces = [(_list_inside(nodes, seen, piece), piece) for nodes, piece in pieces]
+    pieces = [(nodes, piece) for nodes, piece in pieces if nodes and piece.area > _LEAST_AREA * unit**2]
+    free, rooms = set(members) - {node for nodes, _ in pieces for node in nodes}, []
+    for nodes, piece in pieces:
+        ring = shapely.normalize(piece).exterior
+        corners = np.array((ring if ring.is_ccw else ring.reverse()).coords)[:-1]
+        rooms.append((nodes + _list_inside(sorted(free), seen, piece), corners))
     return rooms
+
+
+def _list_inside(nodes: Iterable[int], sights: dict[int, _Sight], shape: shapely.Geometry) -> tuple[int, ...]:
+    """The panoramas whose cameras are in a shape."""
+    return tuple(node for node in nodes if shape.contains(shapely.Point(sights[node].center)))
 
 
 def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
@@ -478,7 +483,8 @@ def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
 def _separate(
     shapes: Sequence[tuple[tuple[int, ...], shapely.Geometry]], sights: dict[int, _Sight]
 ) -> list[tuple[tuple[int, ...], shapely.Geometry]]:
-    """The rooms without the places that belong to other ones: those of the room with the nearest camera."""
+    """The rooms without the places that belong to other ones: those of the room with most cameras there, or the nearest
+    one."""
     result = [shape for _, shape in shapes]
     centers = [shapely.MultiPoint([sights[node].center for node in nodes]) for nodes, _ in shapes]
     for a, b in itertools.combinations(range(len(shapes)), 2):
@@ -487,7 +493,8 @@ def _separate(
             if piece.area == 0:
                 continue
             place = piece.representative_point()
-            loser = b if centers[a].distance(place) < centers[b].distance(place) else a
+            rank = {k: (len(_list_inside(shapes[k][0], sights, piece)), -centers[k].distance(place)) for k in (a, b)}
+            loser = min(b, a, key=lambda k: rank[k])
             result[loser] = result[loser].difference(piece)
     return [(nodes, shape) for (nodes, _), shape in zip(shapes, result, strict=True)]
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from pansplat.gaussians.scene import Scene
 
 OPAQUE = 0.5  # least opacity of the surfaces that hide and block
+_ROWS, _COLUMNS = 180, 360  # of equal solid angles
 
 
 def locate_surfaces(
@@ -31,6 +32,20 @@ def locate_surfaces(
     return (gaussians.means[shown].double().cpu().numpy() - scene.cam2world[view, :3, 3].double().cpu().numpy()).dot(
         level
     )
+
+
+def sample_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
+    """The places of `locate_surfaces`, of each of many equal solid angles the one of median distance.
+
+    Pictures of much detail have more Gaussians: where they are and how many has no influence on what is measured here.
+    """
+    places = locate_surfaces(scene, view, level)
+    distances = np.maximum(np.linalg.norm(places, axis=1), 1e-9)
+    columns = (np.arctan2(places[:, 0], places[:, 2]) / (2 * math.pi) % 1.0 * _COLUMNS).astype(int) % _COLUMNS
+    cells = columns * _ROWS + ((places[:, 1] / distances + 1) / 2 * _ROWS).astype(int).clip(0, _ROWS - 1)
+    order = np.lexsort((distances, cells))
+    borders = np.flatnonzero(np.diff(cells[order], prepend=-1, append=-1))
+    return places[order[(borders[:-1] + borders[1:] - 1) // 2]]
 
 
 def split_by_azimuth(

@@ -1,5 +1,6 @@
 """Every folder format gives the same cameras, and invalid folders are refused with the reason."""
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
-from pansplat.inputs.folders import find_panorama_folders, load_collections, load_pairs
+from pansplat.inputs.folders import find_panorama_folders, load_collections, load_pairs, make_names_unique
 from pansplat.inputs.pairs import Link
 
 OPENCV = "cam2world opencv"
@@ -139,6 +140,8 @@ def test_pairs_of_nested_folders_have_unique_names(tmp_path: Path) -> None:
     pairs = load_pairs(tmp_path)
     assert [pair.folder.parent.name for pair in pairs] == ["a", "b", "c"]
     assert len({pair.name for pair in pairs}) == 3
+    pairs = [dataclasses.replace(pairs[0], name=name) for name in ("x", "x", "room_x_1", "room_x_2")]
+    assert len({pair.name for pair in make_names_unique(pairs)}) == 4, "a numbered name may be that of another pair"
 
 
 def test_without_pairs_file_panoramas_are_paired_along_the_spanning_tree(tmp_path: Path) -> None:

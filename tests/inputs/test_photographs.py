@@ -18,10 +18,11 @@ def test_panoramas_and_faces_of_a_folder_are_listed_by_name(
 ) -> None:
     write_scene(tmp_path / "hall.jpg", 64)
     write_scene(tmp_path / "hall.png", 32)
+    write_scene(tmp_path / "hall_jpg.jpg", 32)
     for face in "frblud":
         Image.fromarray(color_face(face, 16)).save(tmp_path / f"attic_{face}.png")
     panoramas = load_panoramas(tmp_path)
-    assert [panorama.name for panorama in panoramas] == ["attic", "hall_jpg", "hall_png"]
+    assert [panorama.name for panorama in panoramas] == ["attic", "hall_jpg", "hall_jpg_2", "hall_png"]
     for panorama in panoramas:
         check_colors(read_panorama(panorama.image, 32)[0])
 

@@ -78,3 +78,27 @@ def test_panoramas_that_are_not_placed_neither_add_nor_merge_storeys(room_scene)
     assert floor.assign_storeys(tour) == [0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0]
     assert floor.find_other_storeys(tour, tour.positions[0]) == {3, 4, 5}
     assert floor.find_other_storeys(tour, tour.positions[8]) == frozenset(), "it has no storey"
+
+
+def _floor_of(*boxes: tuple[float, float, float, float]) -> np.ndarray:
+    """Places on a floor 1.5 m below a camera at the origin, in boxes of low and high right, low and high forward."""
+    grids = [np.meshgrid(np.arange(a, b, 0.03), np.arange(c, d, 0.03)) for a, b, c, d in boxes]
+    flat = np.concatenate([np.stack([axis.ravel() for axis in grid], axis=1) for grid in grids])
+    blocked = np.zeros(len(flat), bool)
+    for step in np.linspace(0.02, 0.98, 49):  # behind a wall
+        x, y = (flat * step).T
+        blocked |= ~np.any([(a <= x) & (x <= b) & (c <= y) & (y <= d) for a, b, c, d in boxes], axis=0)
+    return np.insert(flat[~blocked], 1, 1.5, axis=1)
+
+
+def test_a_floor_ends_at_a_door_though_it_is_seen_beyond():
+    room, door, beyond = (-2.0, 1.5, -1.5, 2.0), (1.5, 1.7, -0.3, 0.35), (1.7, 6.0, -2.0, 3.0)
+    corners, height = floor.trace_floor(_floor_of(room, door, beyond))
+    assert height == pytest.approx(1.5, rel=0.01)
+    assert corners[:, 0].max() < 2.0 and corners.min(axis=0) == pytest.approx((-2.0, -1.5), abs=0.1)
+
+
+def test_rays_through_several_wide_openings_are_no_outline():
+    wide = [(0.5, 6.0, -0.5, 0.5), (-6.0, -0.5, -0.5, 0.5), (-0.5, 0.5, 0.5, 6.0), (-0.5, 0.5, -6.0, -0.5)]
+    assert floor.trace_floor(_floor_of((-0.9, 0.9, -0.9, 0.9), *wide)) is None
+    assert floor.trace_floor(_floor_of((-0.9, 4.0, -0.9, 0.9), (-0.9, 0.9, -0.9, 4.0))) is not None, "an L is a room"

@@ -277,6 +277,15 @@ def test_a_merged_scene_of_parts_has_their_links_titles_and_gains(home):
     assert part.names == (title,) and part.links == part.starts == part.overlaps == ()
 
 
+def test_links_of_a_scene_lead_to_their_ends_whatever_the_titles_are():
+    titles, ends = ("Hall", "Bath", "Bath (2)", "Bath", ""), (1, 2, 3, 4, 0)
+    links = tuple((start, end, 0.0, 0.0, "") for start, end in enumerate(ends))
+    scene = Scene(empty_gaussians(), torch.eye(4).repeat(5, 1, 1), 1.0, 2.0, titles, links=links)
+    tour = graph.make_graph(scene)
+    assert set(tour.links) == {*enumerate(ends)}
+    assert tuple(panorama.title for panorama in tour.panoramas) == titles
+
+
 def test_a_panorama_at_an_approximate_place_is_drawn_there_and_stays_where_no_camera_flies(home):
     """p3 is 1 m to the right and 2 m ahead of p2, and is turned by a quarter to the right."""
     about = ApproximatePlace(home.panoramas[2].image, 1.0, 2.0, math.pi / 2, ("p2",))

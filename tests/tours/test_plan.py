@@ -10,17 +10,19 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+import shapely.affinity
 import torch
 from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.export.plan_files import _Drawing, describe_plan, write_plan
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
+from pansplat.tours import plan as plan_module
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.plan import Plan, _Lines, _rays, _Sight, _trace_outline
+from pansplat.tours.plan import Plan, _Lines, _rays, _separate, _Sight, _trace_outline
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -198,6 +200,57 @@ def test_a_corridor_whose_end_is_no_wall_ends_at_the_farthest_surface() -> None:
     assert 4.3 < outline.bounds[3] < 4.3 + 0.35 * 1.5, "the right wall meets the first ray of the corridor after 8 m"
 
 
+def test_a_room_stays_closed_where_no_wall_explains_what_is_seen_at_a_corner() -> None:
+    """Beyond the corner a sixth of the horizon looks into another room, which ends in a line with a wall ahead."""
+    normals, offsets = ((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0)), (1.6, 1.24, -1.74, -1.6, 0.6)
+    lines = _Lines(np.array(normals), np.array(offsets))
+    reach = lines.offsets / (_rays() @ lines.normals.T)
+    reach = np.where(reach > 0, reach, np.inf)
+    seen = reach[:, :4].min(axis=1)
+    seen[230:282], seen[282:288] = 4.0, reach[282:288, 4]
+    walls = seen[:, None] * _rays()
+    outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
+    assert outline is not None
+    assert outline.bounds == pytest.approx((-1.74, -1.6, 1.6, 1.24)) and outline.area == pytest.approx(3.34 * 2.84)
+
+
+def test_rooms_do_not_depend_on_how_many_gaussians_show_a_surface() -> None:
+    """A row of books before a wall, which a third of each ray below the ceiling meets, has the most detail."""
+    plain = _make_house(WALLS, CAMERAS)
+    means, labels = plain.gaussians.means, plain.gaussians.views
+    place = torch.stack([plain.cam2world[k, :3, 3] for k in range(3)]).to(means)[labels.long()]
+    offset = means - place
+    height, angle = -offset[:, 1] / (_CEILING - CAMERA_HEIGHT), torch.atan2(offset[:, 0], offset[:, 2])
+    is_book = (height > 0.6) & (height < 0.68) & (angle.abs() < 0.6)
+    moved = torch.where(is_book[:, None], place + 0.6 * offset, means)
+    moved[is_book, 1] = means[is_book, 1]
+    shelf = dataclasses.replace(plain, gaussians=dataclasses.replace(plain.gaussians, means=moved))
+    books = shelf.gaussians.select(is_book)
+    detailed = dataclasses.replace(shelf, gaussians=Gaussians.cat([shelf.gaussians, *[books] * 15]))
+    few, many = _plan(shelf), _plan(detailed)
+    assert [room.panoramas for room in few.rooms] == [room.panoramas for room in many.rooms] == [(0, 1), (2,)]
+    for room, other in zip(few.rooms, many.rooms, strict=True):
+        assert other.outline == pytest.approx(room.outline, abs=0.02)
+
+
+def test_a_place_that_two_rooms_have_in_common_belongs_to_the_one_whose_camera_is_there() -> None:
+    """The middle of the corridor is nearer to the camera of the other room."""
+    places = np.empty((0, 2))
+    sights = {k: _Sight(np.array(center), places, places, places) for k, center in enumerate(((1.0, 0.5), (5.0, 1.5)))}
+    shapes = [((0,), shapely.box(0, 0, 10, 1)), ((1,), shapely.box(0, 0, 10, 4))]
+    first, second = (shape for _, shape in _separate(shapes, sights))
+    assert first.equals(shapely.box(0, 0, 10, 1)) and second.equals(shapely.box(0, 1, 10, 4))
+
+
+def test_each_camera_of_a_room_is_in_its_outline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another room takes the place of the second camera."""
+    taken = shapely.box(-1, 4, 4, 7)
+    monkeypatch.setattr(plan_module, "_separate", lambda shapes, _: [(n, shape - taken) for n, shape in shapes])
+    plan = _plan(_make_house(WALLS, CAMERAS))
+    assert [room.panoramas for room in plan.rooms] == [(0,), (2,)]
+    assert any(line.startswith("no closed walls around panorama 2") for line in describe_plan(plan))
+
+
 def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
     scene = _make_house(_walls_around(HALL), CAMERAS[2:])
     open_room = scene.gaussians.select(scene.gaussians.means[:, 1] > -0.8)
@@ -255,6 +308,30 @@ def test_a_room_at_an_approximate_place_is_dashed_where_its_neighbour_has_it(tmp
     text, known = (tmp_path / "plan.svg").read_text(), _plan(scene).rooms
     assert [room.is_placed for room in known] == [True, False] and "stroke-dasharray" in text
     assert _read_svg(tmp_path / "plan.svg")[1].count("about here") == 1
+
+
+def test_texts_are_neither_on_walls_nor_on_dots_nor_on_one_another() -> None:
+    """The hall is at an approximate place over the corner of the L, and a camera without walls is beside a wall."""
+    names = ("Living room", "Living room", "Hall", "Closet")
+    house = _make_house(WALLS, [*CAMERAS, (5.0, 4.2)], names=names)
+    scene = dataclasses.replace(
+        house,
+        gaussians=house.gaussians.select(house.gaussians.views < 3),
+        overlaps=((0, 1, 0.5), (1, 3, 0.5), (2, 2, 1.0)),
+        approximate=((2, 0, 1.6, 0.4, 0.0),),
+    )
+    drawing = _Drawing(_plan(scene))
+    assert [room.panoramas for room in drawing.plan.rooms] == [(0, 1), (2,)]
+    walls = shapely.union_all([shapely.Polygon(drawing.outline(room)).exterior for room in drawing.plan.rooms])
+    covers = []
+    for text in drawing.list_texts():
+        width, (x, y) = 0.7 * text.size * len(text.text), text.place
+        left = x - width / 2 if text.is_centred else x
+        box = shapely.box(left, y - text.size / 2, left + width, y + text.size / 2)
+        covers.append(shapely.affinity.rotate(box, text.angle))
+        assert not covers[-1].intersects(walls), text
+        assert min(covers[-1].distance(shapely.Point(dot)) for dot in drawing.panoramas) > 0.06, text
+    assert len(covers) > 8 and shapely.union_all(covers).area == pytest.approx(sum(c.area for c in covers))
 
 
 def test_the_picture_is_the_drawing(tmp_path: Path) -> None:
