@@ -124,7 +124,7 @@ class CameraParameters:
     """
 
     def __init__(self, cam2world: Float[Tensor, "view 4 4"], *, correct_poses: bool) -> None:
-        self.cam2world = cam2world.double()
+        self.cam2world = cam2world.double().clone()  # no tensor of torch.inference_mode
         positions = self.cam2world[:, :3, 3]
         self._baseline = float(torch.pdist(positions).max()) if len(positions) > 1 else 0.0
         self.log_gains = torch.zeros(len(cam2world), 3, device=cam2world.device, requires_grad=True)

@@ -126,6 +126,7 @@ class Refinement:
         seed: of the choice of held-out blocks.
     """
 
+    @torch.inference_mode(False)  # the parameters need gradients, whatever the mode of the caller
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
         _check_fit(scene, views)
         self.config = config or RefineConfig()
@@ -183,6 +184,8 @@ class Refinement:
         of_views = [ParameterGroup([view.tensors[name] for view in views], rates[name], betas) for name in names]
         return groups + of_views, of_views
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def step(self, fraction: float) -> None:
         """Rasterise and compare each view once, or in joint drawing all views, and move the Gaussians.
 

@@ -56,6 +56,22 @@ def test_the_result_is_the_same_in_every_run_with_steps(room) -> None:
     assert all(torch.equal(a, b) for a, b in zip(_tensors(first), _tensors(again), strict=True))
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("joint", [False, True])
+def test_a_refinement_without_gradients_of_the_caller_is_the_same(room, mode, joint: bool) -> None:
+    def refine(scene, views):
+        return pansplat.refine(fuse_views(scene) if joint else scene, views, steps=6)
+
+    expected = refine(room.predicted, room.views)
+    with mode():
+        tensors = {name: value.clone() for name, value in vars(room.predicted.gaussians).items()}
+        gaussians = dataclasses.replace(room.predicted.gaussians, **tensors)
+        poses, images = room.views.cam2world.clone(), room.views.images.clone()
+        views = dataclasses.replace(room.views, images=images, cam2world=poses, masks=room.views.masks.clone())
+        refined = refine(dataclasses.replace(room.predicted, gaussians=gaussians, cam2world=poses), views)
+    assert all(torch.equal(a, b) for a, b in zip(_tensors(refined), _tensors(expected), strict=True))
+
+
 def test_the_exposure_of_a_photograph_is_found(room) -> None:
     images = room.views.images.clone()
     images[1] = 0.8 * images[1]
