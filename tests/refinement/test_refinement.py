@@ -149,12 +149,14 @@ def test_a_run_can_be_stopped_at_any_step_and_keeps_its_state(room) -> None:
 
 
 @pytest.mark.usefixtures("refinement_clock")
-def test_a_time_limit_ends_the_run_and_progress_grows(room) -> None:
+def test_a_time_limit_ends_the_run_and_is_said_and_progress_grows(room) -> None:
     fractions: list[float] = []
     with show_progress(lambda what, fraction: fractions.append(fraction)):
-        report = Refinement(room.predicted, room.views).run(seconds=1.0)
-    assert report.steps > 5 and 0.8 < report.seconds < 1.3
+        report = Refinement(room.predicted, room.views).run(steps=1000, seconds=0.2)
+    assert report.stopped == "time limit" and 0 < report.steps < 1000
     assert fractions == sorted(fractions) and fractions[-1] == 1
+    with pytest.warns(InputWarning, match=r"ended after \d+ steps, at its limit of 0.2 s"):
+        pansplat.refine(room.predicted, room.views, steps=1000, seconds=0.2)
 
 
 def test_a_budget_limits_the_gaussians(room) -> None:
