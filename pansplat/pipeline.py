@@ -44,6 +44,7 @@ from pansplat.refinement import (
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import fit_colors
+from pansplat.rendering.gains import equalize_gaussians, equalize_images, measure_gains
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import choose_device, note_full_card, with_device
@@ -470,12 +471,8 @@ def refine(
     """
     refined, report = run_refinement(scene, views, config, seed, steps=steps, seconds=seconds)
     if report.stopped == "time limit":
-        warnings.warn(
-            f"the refinement ended after {report.steps} steps, at its limit of {seconds:g} s; a run without the limit "
-            "has the same result each time",
-            InputWarning,
-            stacklevel=4,
-        )
+        problem = f"the refinement ended after {report.steps} steps, at its limit of {seconds:g} s"
+        warnings.warn(problem, InputWarning, stacklevel=4)
     return refined
 
 
@@ -500,6 +497,9 @@ def _refine_scene(
         refinement = Refinement(moved, views, config, seed=seed)
         report = refinement.run(**run)
         refined = refinement.scene()
+        if report.stopped == "veiled":
+            problem = f"{', '.join(scene.names)}: not refined, because that would cover surfaces between the cameras"
+            warnings.warn(problem, InputWarning, stacklevel=2)
         return replace(refined, gaussians=refined.gaussians.to(device=given)), report
 
     if given.type == "cpu":
@@ -567,9 +567,10 @@ def fuse(scene: Scene, views: Views) -> Scene:
     """
     if len(views.images) == 1:
         return scene
-    fused = fuse_views(scene)
-    colors = fit_colors(fused.gaussians, views.images, fused.cam2world, views.masks, joint=True)
-    return replace(fused, gaussians=colors)
+    fused, poses = fuse_views(scene), scene.cam2world
+    gains = measure_gains(fused.gaussians, views.images, poses, views.masks, joint=True)
+    gaussians, images = equalize_gaussians(fused.gaussians, gains, poses), equalize_images(views.images, gains)
+    return replace(fused, gaussians=fit_colors(gaussians, images, poses, views.masks, joint=True))
 
 
 @with_device

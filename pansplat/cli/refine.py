@@ -122,6 +122,7 @@ def _describe(report: RefineReport, compared: str) -> str:
         "interrupted": ", interrupted",
         "time limit": ", ended by --seconds",
         "single view": "; a single view is not refined",
+        "veiled": "; the given scene is kept, because the refined one covers its surfaces between the cameras",
         "worse": "; the given scene is kept, because the refined one is not better",
     }[report.stopped]
     errors = f"{report.before:.4f} before, {report.after:.4f} after"

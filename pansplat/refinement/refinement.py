@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -27,15 +28,18 @@ from torch.nn import functional
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
-from pansplat.geometry.pose import nearest_views
+from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.pose import interpolate_poses, nearest_views
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.views import Views
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
+from pansplat.refinement.fusion import measure_cover
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import LEARNING_RATES, CameraParameters, ViewParameters
 from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import fit_colors
+from pansplat.rendering.gains import equalize_gaussians, equalize_images, measure_gains
 from pansplat.rendering.weights import compute_blending_weights
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
@@ -57,6 +61,7 @@ _RATE_FLOOR = 0.05  # of the learning rates at the end
 _HOLD = 20.0  # weight of the mean squared change of the logarithms of distances
 _POSE_HOLD = 100.0  # weight of the squared corrections of poses, in radians and relative to the baseline
 _RELEASE = 0.75  # fraction of the run after which held-out blocks are fitted too
+_MAX_VEIL = 0.01  # of the sphere, that a refined scene may newly cover in front of the given one
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
@@ -86,8 +91,8 @@ class RefineReport:
 
     Attributes:
         steps, seconds: of the run.
-        stopped: why it ended: "done", "converged", "interrupted", "time limit", "worse" if the given scene is kept, or
-            "single view", which is not refined.
+        stopped: why it ended: "done", "converged", "interrupted", "time limit", "single view", which is not refined, or
+            why the given scene is kept: "worse", or "veiled" by what a path between the cameras shows in front of it.
         before: mean absolute error of the held-out blocks at the start, of the scene within the limit of Gaussians.
         after: the same before the last part of the run, which fits these blocks, or at the end of a run without it.
     """
@@ -140,20 +145,25 @@ class Refinement:
         height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
         self._contribution_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
+        if limit is not None and len(scene.gaussians) > limit:
+            scene = merge_to(scene, self._contribution_size, limit)
+        self._start, poses = scene, scene.cam2world
+        self._log_gains = measure_gains(scene.gaussians, self._images, poses, compared, joint=scene.joint)
+        gaussians = equalize_gaussians(scene.gaussians, self._log_gains, poses)
+        if scene.joint:
+            self._start = dataclasses.replace(scene, gaussians=gaussians, gains=self.gains)
+        equal = equalize_images(self._images, self._log_gains)
         held_out = 0.0 if scene.joint else _HELD_OUT
         self._photographs = [
             Photograph.split(image, mask > 0.999, held_out, random)
-            for image, mask in zip(
-                self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
-            )
+            for image, mask in zip(self._shrink(equal), self._shrink(compared[:, None].float())[:, 0], strict=True)
         ]
-        if limit is not None and len(scene.gaussians) > limit:
-            scene = merge_to(scene, self._contribution_size, limit)
-        self._start, gaussians = scene, scene.gaussians
-        self._views = {
-            int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
-            for view in torch.unique(gaussians.views)
-        }
+        self._views = {}
+        for view in torch.unique(gaussians.views).tolist():
+            near = nearest_views(poses, view, 1)
+            # Layers are free: blended with those of other views, they may hold what only their own photograph shows.
+            baseline = float((poses[near, :3, 3] - poses[view, :3, 3]).norm()) if scene.joint else 0.0
+            self._views[view] = ViewParameters(gaussians.select(gaussians.views == view), poses[view, :3, 3], baseline)
         self._layers = [
             _Layer((view,), (view, *nearest_views(scene.cam2world, view, MAX_OTHERS)), view) for view in self._views
         ]
@@ -172,7 +182,7 @@ class Refinement:
     def _group_parameters(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
         """All groups, and those of them that hold the Gaussians: one for each of `ViewParameters.NAMES`."""
         rates, betas = LEARNING_RATES, _POSE_BETAS if self.config.poses else _BETAS
-        groups = [ParameterGroup([self._cameras.log_gains], rates["gain"], betas)]
+        groups = []
         if self.config.poses:
             groups.append(ParameterGroup([self._cameras.twists], rates["pose"], betas))
         views = self._views.values()
@@ -276,9 +286,8 @@ class Refinement:
         return errors * (gaussians.scales.amax(1) > math.pi / self._size[0] * distances)
 
     def _draw(self, gaussians: Gaussians, layer: _Layer, target: int) -> Tensor:
-        """The colours (3 height width) of a layer's Gaussians in a photograph, with its gain."""
-        color = rasterize(gaussians, self._cameras.pose_in_view(layer.source, target), size=self._size).color
-        return color if target == layer.source else color * self._cameras.gains(layer.source, target)[:, None, None]
+        """The colours (3 height width) of a layer's Gaussians in a photograph."""
+        return rasterize(gaussians, self._cameras.pose_in_view(layer.source, target), size=self._size).color
 
     @torch.no_grad()
     def held_out_error(self) -> float:
@@ -300,6 +309,20 @@ class Refinement:
         return error / weight if weight > 0 else 0.0
 
     @torch.no_grad()
+    def measure_veil(self) -> float:
+        """Largest share of the sphere that is newly covered in front of the given surfaces, between neighbours."""
+        largest, poses = 0.0, self._start.cam2world
+        for layer in self._layers:
+            given, refined = self._start.gaussians, self._build(layer)
+            if layer.source is not None:
+                given = given.select(given.views == layer.source)
+            pairs = {(view, *nearest_views(poses, view, 1)) for view in layer.views if len(poses) > 1}
+            for (view, other), fraction in itertools.product(sorted(pairs), (0.25, 0.5, 0.75)):
+                pose = interpolate_poses(poses[view], poses[other], fraction)
+                largest = max(largest, measure_cover(refined, given, pose) - measure_cover(given, given, pose))
+        return largest
+
+    @torch.no_grad()
     def scene(self) -> Scene:
         """The scene in its present state.
 
@@ -310,15 +333,16 @@ class Refinement:
             return self._result or self._start
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
         poses = torch.stack([self._cameras.corrected_pose(view) for view in range(len(self._photographs))])
-        return dataclasses.replace(
-            self._start, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._start.cam2world), gains=self.gains
-        )
+        gaussians, poses = Gaussians.cat(parts), poses.to(self._start.cam2world)
+        if not self._start.joint:  # the colours of a view are those of its photograph
+            gaussians = equalize_gaussians(gaussians, -self._log_gains, poses)
+        return dataclasses.replace(self._start, gaussians=gaussians, cam2world=poses, gains=self.gains)
 
     @property
     def gains(self) -> Gains:
-        """Factors of the photographs' channels relative to their geometric mean."""
-        logs = self._cameras.log_gains.detach()
-        return tuple(tuple(row) for row in (logs - logs.mean(0)).exp().tolist())
+        """Mean exposures of the photographs' channels relative to those of the joint colours."""
+        area = row_weights(self._log_gains.shape[-2]).to(self._log_gains)[:, None]
+        return tuple(tuple(row) for row in (-(self._log_gains * area).mean((2, 3)) / area.mean()).exp().tolist())
 
     @stage()
     def run(
@@ -368,15 +392,18 @@ class Refinement:
             if stale >= _PATIENCE:
                 stopped, after, total = "converged", error, done / _RELEASE  # the last part begins now
         after = self.held_out_error() if after is None else after
+        if after <= before and self.measure_veil() > _MAX_VEIL:
+            stopped = "veiled"
+        elif after > before:
+            stopped = "worse"
+        is_kept = stopped in ("worse", "veiled")
         report_progress("fitting colours", _STEPS_SHARE)
-        self._result = self.scene() if after <= before else self._start
+        self._result = self._start if is_kept else self.scene()
         self._free_parameters()
-        if after <= before:
+        if not is_kept:
             detail = self._contribution_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
             self._result = drop_unseen(self._result, self._contribution_size, detail * DROP_ERROR)
-        else:
-            stopped = "worse"
-        if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
+        if not is_kept or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)
         report_progress("refined", 1.0)
         return RefineReport(done, time.perf_counter() - start, stopped, before, after)
@@ -390,9 +417,7 @@ class Refinement:
 
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""
-        images = self._images
-        if scene.joint and scene.gains:
-            images = images / torch.tensor(scene.gains).to(images)[:, :, None, None]
+        images = equalize_images(self._images, self._log_gains) if scene.joint else self._images
         colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, joint=scene.joint)
         return dataclasses.replace(scene, gaussians=colors)
 

@@ -6,15 +6,17 @@ import math
 import pytest
 import torch
 from fake_card import CARD, pretend_card
+from synthetic_scenes import make_balls
 
 import pansplat
 from pansplat import pipeline
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.scene import empty_gaussians
+from pansplat.gaussians.scene import Gaussians, empty_gaussians
 from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, fuse_views, refinement_fingerprint
 from pansplat.refinement import refinement as module
 from pansplat.refinement.budget import merge_to
+from pansplat.refinement.fusion import measure_cover
 from pansplat.refinement.parameters import LEARNING_RATES
 from pansplat.rendering import rasterize
 from pansplat.system.progress import show_progress
@@ -122,6 +124,40 @@ def test_a_scene_that_gets_worse_is_returned_unchanged(room, monkeypatch) -> Non
     assert report.stopped == "worse" and kept is room.truth
     kept, report = _refine(room, scene=room.truth, steps=6, gaussians=900)
     assert report.stopped == "worse" and len(kept.gaussians) <= 900
+
+
+def test_what_parallax_shows_keeps_its_shape_and_nothing_becomes_much_more_opaque(room) -> None:
+    offsets = room.predicted.gaussians.means - room.predicted.cam2world[room.predicted.gaussians.views, :3, 3].float()
+    changes = []
+    for baseline in (0.6, 6.0):  # of the same photographs, which then contradict the scene
+        poses = room.predicted.cam2world.clone()
+        poses[:, :3, 3] *= baseline / 0.6
+        means = offsets + poses[room.predicted.gaussians.views, :3, 3].float()
+        given = dataclasses.replace(room.predicted.gaussians, means=means)
+        scene = dataclasses.replace(room.predicted, gaussians=given, cam2world=poses, joint=True)
+        refinement = Refinement(scene, dataclasses.replace(room.views, cam2world=poses), RefineConfig(splits=()))
+        for step in range(20):
+            refinement.step(step / 40)
+        moved = refinement.scene().gaussians
+        assert (moved.opacities.logit() <= given.opacities.logit() + 0.7 + 1e-3).all()
+        distances = [(each.means - poses[given.views, :3, 3].float()).norm(dim=1) for each in (moved, given)]
+        changes.append(float((distances[0] / distances[1]).log().abs().max()))
+    assert changes[1] < 0.003 < changes[0] < 0.11
+
+
+def test_a_scene_that_covers_what_is_between_the_cameras_is_left_out_and_that_is_said(room, monkeypatch) -> None:
+    joint, middle = fuse_views(room.predicted), room.truth.pose_between(0.5)
+    ball = make_balls(middle[:3, 3].float() + torch.tensor([[0.0, 0.0, 0.5]]), 0.1)
+    veiled = Gaussians.cat([joint.gaussians, ball])
+    assert measure_cover(joint.gaussians, joint.gaussians, middle) < 0.005
+    assert 0.01 < measure_cover(veiled, joint.gaussians, middle) < 0.1
+    monkeypatch.setattr(Refinement, "_build", lambda self, layer: veiled)
+    assert Refinement(joint, room.views).measure_veil() > module._MAX_VEIL
+    monkeypatch.undo()
+    monkeypatch.setattr(module, "_MAX_VEIL", -1.0)
+    with pytest.warns(InputWarning, match="left, right: not refined, because that would cover surfaces"):
+        kept = pansplat.refine(room.predicted, room.views, steps=4)
+    assert all(torch.equal(a, b) for a, b in zip(_tensors(kept), _tensors(room.predicted), strict=True))
 
 
 def test_a_run_is_judged_before_it_fits_the_held_out_blocks(room, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,7 +282,7 @@ def test_photographs_that_do_not_fit_are_refused(room, change, message: str) -> 
         Refinement(scene, views)
 
 
-@pytest.mark.parametrize("limits", [{}, {"seconds": 1.0, "steps": 1}, {"steps": 0}, {"seconds": math.nan}])
+@pytest.mark.parametrize("limits", [{"seconds": 0.0, "steps": 1}, {"steps": 0}, {"seconds": math.nan, "steps": 1}])
 def test_invalid_limits_are_refused(room, limits: dict) -> None:
     with pytest.raises(InputError, match="of a refinement"):
         Refinement(room.predicted, room.views).run(**limits)
