@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
-from pansplat.gaussians.scene import Gains, Gaussians, Scene
+from pansplat.gaussians.scene import Gains, Gaussians
 from pansplat.inputs.content import hash_context
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
-from pansplat.refinement import RefineConfig, RefineReport, refinement_fingerprint
+from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.system.store import Store, hash_parts
 
 _MAX_LEVELS = 256  # of Gaussians; their labels are bytes
-_ENOUGH_STEPS = 40  # of a refinement; more change little
-_STARVED_SHARE = 1 / 3  # of the processor's threads, below which a refinement of fewer steps is starved by load
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +24,10 @@ class CachedScene:
 
     Attributes:
         gaussians, gains: see `Scene`.
-        steps: of the refinement; 0 for a prediction.
-        is_starved: whether the refinement did few steps because other processes had the processor.
     """
 
     gaussians: Gaussians
     gains: Gains = ()
-    steps: int = 0
-    is_starved: bool = False
 
 
 class CachedPrediction:
@@ -45,7 +39,7 @@ class CachedPrediction:
 
     def __init__(self, source: Pair | Views, predictor: Predictor, options: PredictOptions, *, refined: bool) -> None:
         self._pair = source if isinstance(source, Pair) and options.cache else None
-        self._kind, self._found = "refinement" if refined else "prediction", None
+        self._kind = "refinement" if refined else "prediction"
         code = refinement_fingerprint(RefineConfig(gaussians=options.gaussians)) if refined else ""
         self._settings = [predictor.fingerprint, code, *options.describe(refined=refined)]
         self._key = self._make_key()
@@ -57,21 +51,7 @@ class CachedPrediction:
     def read(self) -> CachedScene | None:
         """The content; None if there is none."""
         count = 0 if self._pair is None else len(self._pair.context)
-        self._found = self._store.read(self._kind, self._key, lambda content: _is_valid(content, count))
-        return self._found
-
-    def write_refinement(self, scene: Scene, report: RefineReport, processor_seconds: float) -> CachedScene:
-        """Write a refinement, or what `read` has found if that has more steps; returns what is written.
-
-        A refinement of few steps that shared the processor with other work is starved: it is to be run once more.
-        """
-        found, share = self._found, processor_seconds / (report.seconds * torch.get_num_threads())
-        is_short = report.stopped == "done" and report.steps < _ENOUGH_STEPS and share < _STARVED_SHARE
-        content = CachedScene(scene.gaussians, scene.gains, report.steps, is_short and found is None)
-        if found is not None and found.steps > report.steps:
-            content = replace(found, is_starved=False)
-        self.write(content)
-        return content
+        return self._store.read(self._kind, self._key, lambda content: _is_valid(content, count))
 
     def write(self, content: CachedScene) -> None:
         """Write the content, unless a file has changed since the key was made."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -45,6 +44,7 @@ from pansplat.refinement import (
 from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.color_fit import fit_colors
+from pansplat.rendering.gains import equalize_gaussians, equalize_images, measure_gains
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import choose_device, note_full_card, with_device
@@ -84,6 +84,9 @@ _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which h
 _GAUSSIANS_PER_SQUARE = 0.75  # of a panorama, over the square of its height; about those of the default model
 _BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
 _PIXEL_SECONDS = 2e-7  # of an image of a scene of a pair, on two cores (docs/bench_raster.md)
+_REFINE_STEPS = 40  # that take about 10 s of a pair on two cores; more change little
+_JOINT_STEPS, _MIN_STEPS = 80, 8  # of joint drawing, about 20 s; at least, for each photograph
+_STEP_SECONDS = 0.25  # of a step on two cores
 _MAX_MERGED = 4  # Gaussians that become one on average
 
 
@@ -231,11 +234,6 @@ def find_max_views(predictor: Predictor) -> int:
     return getattr(predictor, "max_views", MAX_SCENE_VIEWS)
 
 
-def scale_seconds(seconds: float, pair: Pair) -> float:
-    """The time limit of a refinement of all views of a pair, from that of three panoramas (`MAX_SCENE_VIEWS`)."""
-    return seconds * max(len(pair.context) / MAX_SCENE_VIEWS, 1.0)
-
-
 def _find_min_views(predictor: Predictor) -> int:
     return getattr(predictor, "min_views", 1)
 
@@ -257,7 +255,7 @@ def choose_height(pair: Pair, predictor: Predictor) -> int:
 
 
 def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.inf) -> PredictOptions:
-    """The options of a scene of a tour, from those of the tour, whose time limit is that of three panoramas.
+    """The options of a scene of a tour, from those of the tour.
 
     The height, by default that of the photographs, at most 512, is halved while the prediction has more than four times
     as many Gaussians as are kept: a refinement after a few mergers fits the photographs better than after many.
@@ -272,19 +270,16 @@ def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.in
         while height >= 2 * MIN_HEIGHT and _GAUSSIANS_PER_SQUARE * height**2 > _MAX_MERGED * gaussians:
             height //= 2
     count = None if math.isinf(gaussians) else max(int(gaussians * len(pair.context)), 1)
-    seconds = choose_refine_seconds(None) if options.refine_seconds is None else options.refine_seconds
-    return replace(options, height=height, refine_seconds=scale_seconds(seconds, pair), gaussians=count)
+    return replace(options, height=height, gaussians=count)
 
 
-def choose_refine_seconds(gaussians: int | None, *, joint: bool = False) -> float:
-    """Default time limit of a refinement, of a scene for joint drawing or for deferred blending.
+def choose_refine_steps(views: int, *, joint: bool = False) -> int:
+    """Default number of steps of a refinement, of a scene for joint drawing or for deferred blending.
 
-    With a limit of Gaussians it is longer, because the images have more rows. In joint drawing, too: the Gaussians of
-    different views have to fit together.
+    A step compares each view with a photograph, in joint drawing all views together with one. Few large steps leave a
+    scene of many views worse than before.
     """
-    if gaussians is not None:
-        return 30.0
-    return 20.0 if joint else 10.0
+    return max(_JOINT_STEPS, _MIN_STEPS * views) if joint else _REFINE_STEPS
 
 
 def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
@@ -346,8 +341,8 @@ def predict(
         compat, precision, depth_network: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
             size.
-        refine_seconds: time limit of the refinement. By default 0, for none; that of `PredictOptions` is None, which is
-            `choose_refine_seconds`. A single view is not refined.
+        refine_steps: of the refinement. By default 0, for none; that of `PredictOptions` is None, which is
+            `choose_refine_steps`. A single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it.
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
             a refinement, only the colours are fitted.
@@ -355,7 +350,7 @@ def predict(
         device: of all work in the call, "cpu", "cuda" or "auto": a graphics card for long work (docs/platforms.md).
     """
     task = _prepare(source, *_choose_options(model, options, keywords))
-    if task.options.refine_seconds:
+    if task.options.refine_steps:
         return _refine_prediction(task, on_predicted)
     scene = _predict_views(task)
     return fuse(scene, task.views) if task.options.joint else scene
@@ -366,12 +361,12 @@ def _choose_options(
 ) -> tuple[Predictor, PredictOptions]:
     """The predictor and the options of a call; without an object of options there is no refinement by default."""
     is_named = isinstance(model, (str, Path))
-    options = PredictOptions(refine_seconds=0.0) if options is None else options
+    options = PredictOptions(refine_steps=0) if options is None else options
     options = options.replace(**keywords, **({"model": str(model)} if is_named else {}))
     RefineConfig(gaussians=options.gaussians)
-    seconds = options.refine_seconds
-    if seconds is not None and not 0 <= seconds < math.inf:
-        raise InputError(f"`refine_seconds` must be at least 0, got {seconds}")
+    steps = options.refine_steps
+    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 0):
+        raise InputError(f"`refine_steps` must be a whole number of at least 0, got {steps}")
     return load_predictor(options) if model is None or is_named else model, options
 
 
@@ -381,16 +376,16 @@ def _prepare(
     options: PredictOptions,
 ) -> _Task:
     """The task of `predict`; what cannot be predicted is refused."""
-    seconds = options.refine_seconds
+    steps = options.refine_steps
     with stage(POSED), choose_caches(options):
         pair = _load_source(source)
     _require_views(pair, predictor)
-    is_single = len(pair.images if isinstance(pair, Views) else pair.context) == 1
-    joint = options.joint and not is_single
-    if seconds is None:
-        seconds = choose_refine_seconds(options.gaussians, joint=joint)
+    count = len(pair.images if isinstance(pair, Views) else pair.context)
+    is_single, joint = count == 1, options.joint and count > 1
+    if steps is None:
+        steps = choose_refine_steps(count, joint=joint)
     height = pair.images.shape[-2] if isinstance(pair, Views) else options.height or choose_height(pair, predictor)
-    chosen = replace(options, height=height, refine_seconds=0.0 if is_single else float(seconds), joint=joint)
+    chosen = replace(options, height=height, refine_steps=0 if is_single else steps, joint=joint)
     task = _Task(pair, predictor, chosen)
     if not is_single and float(torch.pdist(task.cam2world[:, :3, 3]).max()) < ONE_POSITION * pair.near:
         names = pair.names if isinstance(pair, Views) else [view.name for view in pair.context]
@@ -424,7 +419,7 @@ def _refine_prediction(task: _Task, on_predicted: Callable[[Scene], None] | None
     """The scene after its refinement."""
     cached, options = task.open_cache(refined=True), task.options
     found = cached.read()
-    final = None if found is None or found.is_starved else _make_scene(found, task, options.joint)
+    final = None if found is None else _make_scene(found, task, options.joint)
     if final is not None and on_predicted is None:
         report_progress("read from the cache", 1.0)
         return final
@@ -436,13 +431,13 @@ def _refine_prediction(task: _Task, on_predicted: Callable[[Scene], None] | None
         on_predicted(scene)
     if final is not None:
         return final
-    began = time.process_time()
     photographs = task.views
     if isinstance(task.source, Pair) and options.gaussians is not None:
         photographs = load_photographs(task.source, scene.height, options.gaussians)
     config = RefineConfig(gaussians=options.gaussians)
-    refined, report = _refine_scene(scene, photographs, config, seconds=options.refine_seconds)
-    content = cached.write_refinement(refined, report, time.process_time() - began)
+    refined, _ = _refine_scene(scene, photographs, config, steps=options.refine_steps)
+    content = CachedScene(refined.gaussians, refined.gains)
+    cached.write(content)
     return _make_scene(content, task, options.joint)
 
 
@@ -452,8 +447,8 @@ def refine(
     scene: Scene,
     views: Views,
     *,
-    seconds: float | None = None,
     steps: int | None = None,
+    seconds: float = math.inf,
     config: RefineConfig | None = None,
     seed: int = 0,
 ) -> Scene:
@@ -464,8 +459,8 @@ def refine(
     Args:
         scene: of one input camera for each photograph.
         views: the photographs, such as `pair.load_context(height)`; masked pixels are not compared.
-        seconds: time limit, by default `choose_refine_seconds`; the result depends on the speed of the machine.
-        steps: number of steps instead, for the same result in every run.
+        steps: number of steps, by default `choose_refine_steps`; the result is the same in every run.
+        seconds: limit after which the run ends early, with a warning; the result depends on the speed of the machine.
         config: settings of the objective, the step sizes and the number of Gaussians.
         seed: of the blocks of pixels that are held out of the loss.
         device: see `predict`; a scene on a card is refined there.
@@ -473,7 +468,11 @@ def refine(
     Returns:
         The refined scene, or the given one if held-out pixels show that it is better, or if it is of a single view.
     """
-    return run_refinement(scene, views, config, seed, seconds=seconds, steps=steps)[0]
+    refined, report = run_refinement(scene, views, config, seed, steps=steps, seconds=seconds)
+    if report.stopped == "time limit":
+        problem = f"the refinement ended after {report.steps} steps, at its limit of {seconds:g} s"
+        warnings.warn(problem, InputWarning, stacklevel=4)
+    return refined
 
 
 def run_refinement(
@@ -481,8 +480,8 @@ def run_refinement(
 ) -> tuple[Scene, RefineReport]:
     """The refined scene and what the refinement did; `run` holds arguments of `Refinement.run`."""
     poses = scene.frame.localize(views.frame.globalize(views.cam2world))
-    if run["steps"] is None and run["seconds"] is None:
-        run["seconds"] = choose_refine_seconds(None if config is None else config.gaussians, joint=scene.joint)
+    if run["steps"] is None:
+        run["steps"] = choose_refine_steps(len(views.images), joint=scene.joint)
     return _refine_scene(scene, replace(views, cam2world=poses, frame=scene.frame), config, seed, **run)
 
 
@@ -497,11 +496,13 @@ def _refine_scene(
         refinement = Refinement(moved, views, config, seed=seed)
         report = refinement.run(**run)
         refined = refinement.scene()
+        if report.stopped == "veiled":
+            problem = f"{', '.join(scene.names)}: not refined, because that would cover surfaces between the cameras"
+            warnings.warn(problem, InputWarning, stacklevel=2)
         return replace(refined, gaussians=refined.gaussians.to(device=given)), report
 
     if given.type == "cpu":
-        seconds = run.get("seconds")
-        device = choose_device("refinement", math.inf if seconds is None else seconds, kernels=True)
+        device = choose_device("refinement", _STEP_SECONDS * run["steps"], kernels=True)
     try:
         return run_on(device)
     except torch.cuda.OutOfMemoryError:
@@ -527,8 +528,7 @@ def predict_tour(
 
     Args:
         tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, options, compat, precision, depth_network, refine_seconds, cache: see `predict`; the time limit is that
-            of three panoramas.
+        model, options, compat, precision, depth_network, refine_steps, cache: see `predict`.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
         gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
             a refinement; without one the scene may have more.
@@ -538,14 +538,12 @@ def predict_tour(
     if isinstance(tour, (str, Path)):
         with choose_caches(options):
             tour = _load_only_tour(tour)
-    if options.refine_seconds is None:
-        options = replace(options, refine_seconds=choose_refine_seconds(None, joint=options.joint))
     warn_of_single_views(tour, predictor)
-    max_views, is_refined = find_max_views(predictor), bool(options.joint and options.refine_seconds)
+    max_views, is_refined = find_max_views(predictor), options.joint and options.refine_steps != 0
     total = len(tour.choose_sources(max_views))
     part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # of a panorama
     counter = itertools.count(1)
-    each = replace(options, joint=False, refine_seconds=0.0) if options.joint else options
+    each = replace(options, joint=False, refine_steps=0) if options.joint else options
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
         number, pair = next(counter), tour.make_pair(views)
@@ -557,7 +555,7 @@ def predict_tour(
         scene = merge_scenes(tour, predict_scene, max_views)
     if not options.joint:
         return scene
-    return fuse_tour(tour, scene, refine_seconds=options.refine_seconds or 0.0)
+    return fuse_tour(tour, scene, refine_steps=options.refine_steps)
 
 
 def fuse(scene: Scene, views: Views) -> Scene:
@@ -569,19 +567,20 @@ def fuse(scene: Scene, views: Views) -> Scene:
     """
     if len(views.images) == 1:
         return scene
-    fused = fuse_views(scene)
-    colors = fit_colors(fused.gaussians, views.images, fused.cam2world, views.masks, joint=True)
-    return replace(fused, gaussians=colors)
+    fused, poses = fuse_views(scene), scene.cam2world
+    gains = measure_gains(fused.gaussians, views.images, poses, views.masks, joint=True)
+    gaussians, images = equalize_gaussians(fused.gaussians, gains, poses), equalize_images(views.images, gains)
+    return replace(fused, gaussians=fit_colors(gaussians, images, poses, views.masks, joint=True))
 
 
 @with_device
 @with_progress_bar
-def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0) -> Scene:
+def fuse_tour(tour: TourGraph, scene: Scene, *, refine_steps: int | None = 0) -> Scene:
     """The scene of a whole tour with each surface once, and fitted to all photographs of each part.
 
     Args:
         tour, scene: the graph, and its scene by `predict_tour`.
-        refine_seconds: time limit of the refinement, of three panoramas; without one only colours are fitted.
+        refine_steps: see `predict`; without a refinement only colours are fitted.
     """
     fused: list[Gaussians] = []
     gains = [(1.0, 1.0, 1.0)] * len(tour)
@@ -591,9 +590,10 @@ def fuse_tour(tour: TourGraph, scene: Scene, *, refine_seconds: float = 0.0) -> 
         if len(nodes) > 1:
             pair = tour.make_pair(nodes)
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
-            if refine_seconds:
+            steps = choose_refine_steps(len(nodes), joint=True) if refine_steps is None else refine_steps
+            if steps:
                 with stage(number / len(parts)):
-                    part, _ = _refine_scene(fuse_views(part), views, seconds=scale_seconds(refine_seconds, pair))
+                    part, _ = _refine_scene(fuse_views(part), views, steps=steps)
             else:
                 part = fuse(part, views)
         for view, node in enumerate(nodes):
@@ -633,7 +633,7 @@ def predict_to_file(
     task = _prepare(source, *_choose_options(model, options, keywords))
     predictor, options = task.predictor, task.options
     is_cached = options.cache and (options.height or 0) <= _MAX_CACHED_HEIGHT
-    if can_stream(predictor) and not (options.joint or options.refine_seconds or is_cached):
+    if can_stream(predictor) and not (options.joint or options.refine_steps or is_cached):
         views = task.views
         parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
             views.images, views.cam2world, views.near, views.far, masks=views.masks

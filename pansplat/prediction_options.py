@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, Suppress, arg
 
 from pansplat.errors import InputError
-from pansplat.system.options import CAMERA_HEIGHT, Count, Depth, Height, Positive, Seconds
+from pansplat.system.options import CAMERA_HEIGHT, Count, CountOrNone, Depth, Height, Positive
 
 CompatChoice = Literal["trained", "official", "fixed"]
 Precision = Literal["float32", "bfloat16"]
@@ -56,9 +56,9 @@ class PredictOptions:
     height: Height | None = None
     """Panoramas are resized to this height before the prediction, pixels; by default that of the photographs, at
     most 1024 (for networks and tours 512)."""
-    refine_seconds: Annotated[Seconds | None, arg(name="refine")] = None
-    """Time limit of the refinement after the prediction, seconds; 0 for none. By default 10; where each surface is kept
-    once 20, for the page of a pair 30."""
+    refine_steps: Annotated[CountOrNone | None, arg(name="refine")] = None
+    """Steps of the refinement after the prediction; 0 for none. By default 40; where each surface
+    is kept once 80, or 8 for each panorama of a tour."""
     gaussians: Annotated[Count | None, Fixed, Suppress] = None
     joint: Annotated[bool, Fixed, Suppress] = False
     cache: bool = True
@@ -79,7 +79,7 @@ class PredictOptions:
 
 
 _OF_PREDICTOR = "model", "compat", "precision", "depth_network"  # parts of its fingerprint
-_OF_REFINEMENT = "refine_seconds", "gaussians", "joint"
+_OF_REFINEMENT = "refine_steps", "gaussians", "joint"
 
 
 def choose_caches(command: Any) -> AbstractContextManager[None]:

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +13,11 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.pipeline import load_pairs, predict
+from pansplat.prediction_options import PredictOptions
 from pansplat.system.progress import show_progress
 from pansplat.system.store import cache_folders
 
@@ -118,14 +117,12 @@ def gray_pair(pair_folder: Path) -> Path:
     return pair_folder
 
 
-@pytest.mark.usefixtures("refinement_clock")
 def test_a_refined_scene_is_cached_apart_from_its_prediction(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "time", SimpleNamespace(process_time=itertools.count(step=100).__next__))
     predictor, shown = sphere_predictor(), []
-    first = predict(gray_pair, predictor, height=HEIGHT, refine_seconds=1.0, on_predicted=shown.append)
-    again = predict(gray_pair, predictor, height=HEIGHT, refine_seconds=1.0, on_predicted=shown.append)
+    first = predict(gray_pair, predictor, height=HEIGHT, refine_steps=8, on_predicted=shown.append)
+    again = predict(gray_pair, predictor, height=HEIGHT, refine_steps=8, on_predicted=shown.append)
     assert have_equal_gaussians(first, again) and predictor.calls == 1
     assert len(first.gains) == 2 and again.gains == first.gains
     prediction = predict(gray_pair, predictor, height=HEIGHT)
@@ -134,51 +131,38 @@ def test_a_refined_scene_is_cached_apart_from_its_prediction(
     assert len(list((gray_pair / ".pansplat").iterdir())) == 2
 
 
-@pytest.mark.usefixtures("refinement_clock")
-def test_a_refinement_that_load_has_starved_is_run_once_more(
+def test_a_refinement_is_the_same_however_busy_the_machine_is(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work: list[str] = []
-
-    def refine(processor_seconds: float, **limit: float) -> Scene:
-        clock = SimpleNamespace(process_time=itertools.count(step=processor_seconds).__next__)
-        monkeypatch.setattr(pipeline, "time", clock)
-        work.clear()
-        with show_progress(lambda what, _: work.append(what)):
-            return predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=1.0)
-
-    first = refine(0.1)
-    second = refine(0.1)  # starved again, and a run of as many steps
-    assert "refining" in work and have_equal_gaussians(first, second)
-    refine(0.1)
-    assert work == ["read from the cache"]
-    shutil.rmtree(gray_pair / ".pansplat")
-    for _ in range(2):
-        refine(100.0)
-    assert work == ["read from the cache"], "a run that had the processor is kept"
+    scenes = []
+    for delay in (0.0, 100.0):  # seconds between two readings of the clock
+        ticks = itertools.count(step=delay)
+        clock = SimpleNamespace(perf_counter=lambda ticks=ticks: next(ticks))
+        monkeypatch.setattr("pansplat.refinement.refinement.time", clock)
+        scenes.append(predict(gray_pair, sphere_predictor(), options=PredictOptions(height=HEIGHT, cache=False)))
+    assert scenes[0].gains and have_equal_gaussians(*scenes)
 
 
-@pytest.mark.usefixtures("refinement_clock")
 def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predictor) -> None:
     def interrupt(what: str, fraction: float) -> None:
         if what == "refining" and fraction > 0.2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), show_progress(interrupt):
-        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=3.0)
+        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_steps=8)
     assert len(list((pair_folder / ".pansplat").iterdir())) == 1  # the prediction
 
 
-@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
-def test_an_invalid_time_limit_of_the_refinement_is_refused(pair_folder: Path, sphere_predictor, seconds) -> None:
-    with pytest.raises(InputError, match="`refine_seconds` must be at least 0"):
-        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_seconds=seconds)
+@pytest.mark.parametrize("steps", [-1, 2.5, float("nan"), True])
+def test_an_invalid_number_of_steps_of_the_refinement_is_refused(pair_folder: Path, sphere_predictor, steps) -> None:
+    with pytest.raises(InputError, match="`refine_steps` must be a whole number of at least 0"):
+        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_steps=steps)
 
 
 def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_folder: Path, sphere_predictor) -> None:
     predictor = sphere_predictor()
     with pytest.raises(InputError, match="`gaussians` must be at least 1"):
-        predict(pair_folder, predictor, height=HEIGHT, refine_seconds=3.0, gaussians=0)
+        predict(pair_folder, predictor, height=HEIGHT, refine_steps=8, gaussians=0)
     assert predictor.calls == 0
 
 
@@ -193,14 +177,12 @@ def test_one_content_has_one_entry_whatever_names_and_paths_are(pair_folder: Pat
     assert scenes[3].names == ("客厅", "right") and scenes[3].model == other.name
 
 
-@pytest.mark.usefixtures("refinement_clock")
 def test_a_cached_scene_is_opened_without_its_photographs(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "time", SimpleNamespace(process_time=itertools.count(step=100).__next__))
-    first = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=s) for s in (0.0, 1.0)]
+    first = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_steps=s) for s in (0, 8)]
     monkeypatch.setattr(Pair, "load_context", lambda *_: pytest.fail("it is decoded"))
-    again = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_seconds=s) for s in (0.0, 1.0)]
+    again = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_steps=s) for s in (0, 8)]
     for before, after in zip(first, again, strict=True):
         assert have_equal_gaussians(before, after) and torch.equal(before.cam2world, after.cam2world)
         fields = ("near", "far", "names", "model", "height", "gains", "starts", "joint", "frame")

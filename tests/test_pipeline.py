@@ -102,7 +102,7 @@ def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_ca
 
 
 def test_the_options_of_a_command_are_keywords(pair_folder: Path, sphere_predictor, tmp_path: Path) -> None:
-    options, named = PredictOptions(height=64, refine_seconds=0.0, cache=False), {"height": 64, "cache": False}
+    options, named = PredictOptions(height=64, refine_steps=0, cache=False), {"height": 64, "cache": False}
     scenes = (
         predict(pair_folder, sphere_predictor(), options=options),
         predict(pair_folder, sphere_predictor(), **named),

@@ -12,12 +12,12 @@ OTHERS = {
     "precision": "bfloat16",
     "depth_network": Path("depth.onnx"),
     "height": 96,
-    "refine_seconds": 3.0,
+    "refine_steps": 3,
     "gaussians": 9,
     "joint": True,
     "cache": False,
 }
-REFINED = "refine_seconds", "gaussians", "joint"
+REFINED = "refine_steps", "gaussians", "joint"
 
 
 @pytest.mark.parametrize("name", vars(PredictOptions()))

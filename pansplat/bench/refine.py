@@ -1,6 +1,6 @@
-"""`pansplat bench refine`: image error against seconds and Gaussians, for predictors with and without refinement.
+"""`pansplat bench refine`: image error against steps and Gaussians, for predictors with and without refinement.
 
-A row is a pair, a predictor, a height, a time limit of the refinement and a limit of Gaussians. Its errors are those of
+A row is a pair, a predictor, a height, steps of the refinement and a limit of Gaussians. Its errors are those of
 the panoramas between the inputs. The cross-fade of the inputs is the row without geometry.
 
 Values of a row: `ws_psnr_db` and `lpips` of the panoramas between the inputs; `inputs_db`, WS-PSNR at the input cameras
@@ -46,20 +46,20 @@ class RefineCase:
     Attributes:
         model: name of a predictor, or `CROSS_FADE`.
         height: of the panoramas, pixels.
-        limit_s: time limit of the refinement; 0 for none.
+        limit_steps: of the refinement; 0 for none.
         limit_gaussians: None for no limit.
         views: number of the pair's panoramas that the scene is made of; None for all.
     """
 
     model: str
     height: int
-    limit_s: float = 0.0
+    limit_steps: int = 0
     limit_gaussians: int | None = None
     views: int | None = None
 
     def __str__(self) -> str:
         """The case as it is shown while it is measured."""
-        refined = f" + {self.limit_s:g} s" if self.limit_s else ""
+        refined = f" + {self.limit_steps} steps" if self.limit_steps else ""
         limit = f", {self.limit_gaussians:,} Gaussians" if self.limit_gaussians else ""
         views = f", {self.views} view" if self.views else ""
         return f"{self.model}{refined}, {self.height}x{2 * self.height}{limit}{views}"
@@ -69,12 +69,12 @@ def list_refine_cases(*, quick: bool) -> list[RefineCase]:
     """The cases; with `quick`, two of the default predictor at height 256."""
     if quick:
         cases = [RefineCase(CROSS_FADE, 256), RefineCase("default", 256, views=1)]
-        return cases + [RefineCase("default", 256, seconds) for seconds in (0.0, 5.0)]
+        return cases + [RefineCase("default", 256, steps) for steps in (0, 40)]
     cases = [RefineCase(CROSS_FADE, 512), *(RefineCase("default", height, views=1) for height in (256, 512))]
-    cases += [RefineCase("sweep", 512, seconds) for seconds in (0.0, 10.0)]
-    cases += [RefineCase("default", 256, seconds) for seconds in (0.0, 5.0, 10.0)]
-    cases += [RefineCase("default", 512, seconds) for seconds in (0.0, 5.0, 10.0, 20.0)]
-    return cases + [RefineCase("default", 512, 10.0, count) for count in (50_000, 100_000, 200_000)]
+    cases += [RefineCase("sweep", 512, steps) for steps in (0, 40)]
+    cases += [RefineCase("default", 256, steps) for steps in (0, 40, 80)]
+    cases += [RefineCase("default", 512, steps) for steps in (0, 20, 40, 80)]
+    return cases + [RefineCase("default", 512, 40, count) for count in (50_000, 100_000, 200_000)]
 
 
 _ENTRIES = ("suite", *RefineCase.__dataclass_fields__)  # of a mean over the pairs
@@ -129,10 +129,10 @@ def _measure(
 ) -> dict[str, float]:
     """Refine a predicted scene, and compare it with the targets and the inputs."""
     refined = {"refine_s": 0.0, "steps": 0}
-    if case.limit_s:
+    if case.limit_steps:
         workload_s, start = time_workload(), time.perf_counter()
         refinement = Refinement(scene, context, RefineConfig(gaussians=case.limit_gaussians))
-        steps = refinement.run(seconds=case.limit_s).steps
+        steps = refinement.run(steps=case.limit_steps).steps
         scene, refine_s = refinement.scene(), time.perf_counter() - start
         refined = {"refine_s": refine_s, "steps": steps, "step_ratio": refine_s / max(steps, 1) / workload_s}
     render = partial(pipeline.render, size=(case.height, 2 * case.height))
@@ -165,15 +165,15 @@ def plot_refine(rows: Sequence[Row], header: Header) -> Figure:
         label = model if model == CROSS_FADE else f"{model}, {height}x{2 * height}{', one view' if views else ''}"
         axes[0].plot(seconds, [row.get("ws_psnr_db") for row in line], "o-", label=label)
         axes[1].plot(seconds, [row.get("lpips") for row in line], "o-", label=label)
-    largest = max((row.get("limit_s") for row in means if row.get("limit_gaussians")), default=0.0)
-    budgets = [row for row in means if row.get("limit_s") == largest and row.get("model") == "default"]
+    largest = max((row.get("limit_steps") for row in means if row.get("limit_gaussians")), default=0)
+    budgets = [row for row in means if row.get("limit_steps") == largest and row.get("model") == "default"]
     height = max((row.get("height") for row in budgets), default=0)
     points = sorted((row.get("num_gaussians"), row.get("ws_psnr_db")) for row in budgets if row.get("height") == height)
     axes[2].plot([count for count, _ in points], [psnr for _, psnr in points], "o-")
     between, seconds_label = "WS-PSNR between the inputs, dB", "seconds of prediction and refinement"
     axes[0].set(xlabel=seconds_label, ylabel=between)
     axes[1].set(xlabel=seconds_label, ylabel=f"LPIPS ({header['lpips']})" if header["lpips"] else "LPIPS")
-    axes[2].set(xlabel=f"Gaussians, default + {largest:g} s at height {height}", ylabel=between)
+    axes[2].set(xlabel=f"Gaussians, default + {largest} steps at height {height}", ylabel=between)
     axes[2].set_xlim(left=0)
     axes[2].xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
     axes[0].legend(fontsize=8)
@@ -187,7 +187,7 @@ REFINE = Suite(
         Column("model", "model"),
         Column("height", "height", "d"),
         Column("views", lambda row: str(row.get("views") or "all")),
-        Column("refinement", lambda row: f"{limit:g} s" if (limit := row.get("limit_s")) else "none"),
+        Column("refinement", lambda row: f"{limit} steps" if (limit := row.get("limit_steps")) else "none"),
         Column("limit", "limit_gaussians", ","),
         Column("Gaussians", "num_gaussians", ",.0f"),
         Column("predict s", "predict_s", ".1f"),

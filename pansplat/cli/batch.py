@@ -154,7 +154,7 @@ class Batch(Computation):
             for step in (step for step in STEPS if step in self.steps):
                 options = self.prediction
                 if step == "predict" or "refine" not in self.steps:
-                    options = replace(options, refine_seconds=0.0)
+                    options = replace(options, refine_steps=0)
                 suffix = f".{self.format}" if step == "export" else ".ply"
                 export = Export(
                     Path(),

@@ -82,7 +82,7 @@ class BenchRaster(_Options):
             print("without triton: there is no CUDA device")
         groups = raster.list_raster_groups(height, backends, threads)
         if _SAMPLE.is_dir():
-            options = PredictOptions("sweep", height=max(small, _MIN_SWEEP_HEIGHT), refine_seconds=0.0)
+            options = PredictOptions("sweep", height=max(small, _MIN_SWEEP_HEIGHT), refine_steps=0)
             scene = predict_scene(choose_pair(_SAMPLE, PairChoice()), options)
             sample = raster.BenchScene(_SAMPLE.stem, lambda: scene.gaussians, scene.pose_between(0.5))
             groups.append(raster.make_sample_group(sample, small, backends, threads))
@@ -132,12 +132,12 @@ class BenchModel(_Options):
 
 @dataclass(frozen=True)
 class BenchRefine(_Options):
-    """Measure image error against seconds and Gaussians: cross-fade, predictors, and their refinement."""
+    """Measure image error against steps and Gaussians: cross-fade, predictors, and their refinement."""
 
     paths: Positional[tuple[Path, ...]] = ()
     """Folders of pairs with targets; by default the sample, if it is there."""
     quick: bool = False
-    """Height 256 and one time limit only."""
+    """Height 256 and one number of steps only."""
     lpips: LpipsChoice = field(default_factory=LpipsChoice)
 
     def run(self) -> int:

@@ -15,7 +15,7 @@ from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.console import make_table_console, progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import require_output_folder, require_replaceable
-from pansplat.system.options import Height, Seconds
+from pansplat.system.options import CountOrNone, Height
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,7 @@ class _Prediction(PredictOptions):
     """How scenes are predicted. The cache is not used, so that times are valid."""
 
     height: Height | None = _HEIGHT
-    refine_seconds: Annotated[Seconds | None, arg(name="refine")] = 0.0
+    refine_steps: Annotated[CountOrNone | None, arg(name="refine")] = 0
     cache: Annotated[bool, Fixed, Suppress] = False
 
 
@@ -93,7 +93,7 @@ class Evaluate(Computation):
                 predictor,
                 self.out,
                 height=height,
-                refine_seconds=self.prediction.refine_seconds or 0.0,
+                refine_steps=self.prediction.refine_steps or 0,
                 blend=blend,
                 drawing=self.drawing,
                 lpips=lpips,

@@ -46,8 +46,8 @@ class Predict(Computation):
         model = pipeline.load_predictor(self.prediction)
         joint = not self.layers and len(pair.context) > 1 and not pipeline.can_stream(model)
         options = replace(self.prediction, joint=joint)
-        if options.refine_seconds is None and not joint:
-            options = replace(options, refine_seconds=0.0)
+        if options.refine_steps is None and not joint:
+            options = replace(options, refine_steps=0)
         began = time.perf_counter()
         count = pipeline.predict_to_file(pair, self.out, model, options=options, degree=self.degree)
         seconds = time.perf_counter() - began

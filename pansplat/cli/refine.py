@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, is_scene_file, require_output_file
-from pansplat.system.options import Count, Seconds, Seed
+from pansplat.system.options import Count, Positive, Seed
 from pansplat.system.progress import report_progress, stage
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 class _Prediction(PredictOptions):
     """The prediction of a pair. The photographs of a scene file are resized to its height by default."""
 
-    refine_seconds: Annotated[float, Fixed, Suppress] = 0.0
+    refine_steps: Annotated[int, Fixed, Suppress] = 0
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class Refine(Computation):
     """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb."""
     photographs: Path | None = None
     """Folder of the panoramas that a scene file was predicted from."""
-    seconds: Seconds | None = None
-    """Time limit; 20 by default, with --layers 10, with --gaussians 30."""
     steps: Count | None = None
-    """Number of steps instead, for the same result in every run."""
+    """Number of steps; by default 80, with --layers 40."""
+    seconds: Positive | None = None
+    """Limit after which the run ends early, which is said; its result depends on the speed of the machine."""
     layers: bool = False
     """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
     draw all Gaussians together (docs/formats.md)."""
@@ -79,8 +80,8 @@ class Refine(Computation):
                 views,
                 config,
                 self.seed,
-                seconds=self.seconds,
                 steps=self.steps,
+                seconds=self.seconds or math.inf,
                 should_stop=should_stop,
             )
             pipeline.save(refined, self.out)
@@ -93,8 +94,6 @@ class Refine(Computation):
         require_output_file("--out", self.out, SCENE_SUFFIXES, overwrite=self.overwrite)
         if self.poses and not self.layers:
             raise InputError("--poses compares all Gaussians of each view with the photographs; add --layers")
-        if self.seconds is not None and self.steps is not None:
-            raise InputError("--seconds and --steps both set the length of the refinement; give one of them")
         if is_scene_file(self.path) and self.photographs is None:
             raise InputError(f"{self.path} holds no photographs; give the folder of its pair with --photographs")
         if not is_scene_file(self.path) and self.photographs is not None:
@@ -121,7 +120,9 @@ def _describe(report: RefineReport, compared: str) -> str:
         "done": "",
         "converged": ", converged",
         "interrupted": ", interrupted",
+        "time limit": ", ended by --seconds",
         "single view": "; a single view is not refined",
+        "veiled": "; the given scene is kept, because the refined one covers its surfaces between the cameras",
         "worse": "; the given scene is kept, because the refined one is not better",
     }[report.stopped]
     errors = f"{report.before:.4f} before, {report.after:.4f} after"

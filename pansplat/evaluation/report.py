@@ -46,7 +46,7 @@ def evaluate(
     out: Path,
     *,
     height: int = 512,
-    refine_seconds: float = 0.0,
+    refine_steps: int = 0,
     blend: str | int = "deferred",
     drawing: Drawing = "exact",
     lpips: Lpips | None = None,
@@ -61,7 +61,7 @@ def evaluate(
     results.json is written after each pair, so that an interruption keeps the results so far.
 
     Args:
-        refine_seconds: time limit of the refinement of each scene; 0 for none.
+        refine_steps: of the refinement of each scene; 0 for none.
         blend, drawing: see `pipeline.render`. With "joint", scenes are fused (`fuse_views`), but those of networks are
             not: these are trained for joint drawing.
     """
@@ -77,7 +77,7 @@ def evaluate(
         taken = {row.case["name"] for row in rows}
         joint = blend == "joint" and not pipeline.can_stream(predictor)
         with stage(number / len(with_targets), f"{pair.name}: "):
-            rows += _evaluate_pair(pair, predictor, out, taken, height, refine_seconds, joint, options, lpips)
+            rows += _evaluate_pair(pair, predictor, out, taken, height, refine_steps, joint, options, lpips)
         write_json([row.as_json() for row in rows], out / "results.json")
     return rows
 
@@ -96,19 +96,19 @@ def _evaluate_pair(
     out: Path,
     taken: set[str],
     height: int,
-    refine_seconds: float,
+    refine_steps: int,
     joint: bool,
     options: dict[str, Any],
     lpips: Lpips | None,
 ) -> Iterator[Row]:
     context, targets = pair.load_context(height), pair.load_targets(height)
     start = time.perf_counter()
-    with stage(0.5 if refine_seconds else 1.0):
+    with stage(0.5 if refine_steps else 1.0):
         scene = pipeline.predict(context, predictor, joint=joint)
     predict_seconds = time.perf_counter() - start
-    if refine_seconds:
-        start = time.perf_counter()
-        scene = pipeline.refine(scene, context, seconds=refine_seconds)
+    refine_seconds, start = 0.0, time.perf_counter()
+    if refine_steps:
+        scene = pipeline.refine(scene, context, steps=refine_steps)
         refine_seconds = time.perf_counter() - start
     render = pipeline.make_renderer(scene, "images", len(context.images) + len(targets.images), **options)
     own_ws_psnr = measure_own_views(scene, context, lambda _, pose: render(pose))

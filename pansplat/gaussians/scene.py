@@ -159,8 +159,9 @@ class Scene:
         names: image file name of each context view.
         model: name of the predictor, e.g. "sweep".
         height: of the input panoramas, pixels.
-        gains: exposure and white balance of each view's photograph, as factors of R, G and B relative to the geometric
-            mean of all; a refinement estimates them. The colours of a view's Gaussians are those of its photograph.
+        gains: mean exposure and white balance of each view's photograph, as factors of R, G and B relative to the
+            geometric mean of all. The colours of a view's Gaussians are those of its photograph, in joint drawing
+            between those of all (`pansplat.rendering.gains`).
         overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.graph.TourGraph`.
         links: of a scene of a whole tour: the known directions from one panorama towards another one.
         starts: of a scene of a whole tour: one for each view, or none.

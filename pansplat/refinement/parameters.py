@@ -1,4 +1,4 @@
-"""The quantities that the refinement optimises: Gaussians in terms of their source view, gains, and camera poses."""
+"""The quantities that the refinement optimises: Gaussians in terms of their source view, and camera poses."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import invert_pose, multiply_quats, quats_from_rotations, rotations_from_quats
 
 _MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY = 1e-3, 0.999  # whose logit is refined
-_MAX_LOG_DISTANCE = 1.0  # largest change of a logarithm of distance
-_MAX_LOG_SCALE = 3.0  # largest change of a logarithm of scale
+# Largest decrease and increase of the logarithms of distances and scales, of quaternions, and of logits. Without them
+# exposures and wrong shapes are explained by veils and specks between the cameras, which no photograph shows.
+_BOUNDS = {"distance": (0.1, 0.1), "scale": (3.0, 0.3), "rotation": (1.0, 1.0), "opacity": (10.0, 0.7)}
+_LAYER_FREEDOM = 3.0  # factor of the bounds of Gaussians that are drawn without those of other views
+_FREE_PARALLAX = 0.7  # baseline over distance; above it bounds fall with its fourth power
 _MIN_SCALE = 1e-9  # relative to the distance
 _MIN_DISTANCE = 1e-6  # metres
 _SPLIT_SHIFT, _SPLIT_SCALE = 0.5, 0.7  # of the halves of a split Gaussian along its longest axis, relative to its scale
@@ -27,7 +30,6 @@ LEARNING_RATES = {
     "opacity": 0.12,  # of the logits of the opacities
     "color": 0.02,  # of the harmonics of degree 0
     "harmonics": 0.002,  # of the harmonics of higher degree
-    "gain": 0.01,  # of the logarithms of the photographs' gains
     "pose": 0.0005,  # of the cameras' rotations, radians, and of their positions relative to the baseline
 }
 """Step sizes of Adam at the start of a refinement; they fall to a fraction along a cosine."""
@@ -42,6 +44,7 @@ class ViewParameters:
     Args:
         gaussians: of the view; at least one.
         camera: position of the source camera, metres.
+        baseline: distance of the nearest other camera whose Gaussians are drawn together with them, metres; 0 without.
 
     Attributes:
         tensors: by their name in `NAMES`: the change of the logarithm of the distance, logarithms of the scales,
@@ -50,21 +53,21 @@ class ViewParameters:
 
     NAMES = ("distance", "scale", "rotation", "opacity", "color", "harmonics")
 
-    def __init__(self, gaussians: Gaussians, camera: Float[Tensor, "3"]) -> None:
+    def __init__(self, gaussians: Gaussians, camera: Float[Tensor, "3"], baseline: float = 0.0) -> None:
         gaussians = gaussians.to(dtype=torch.float32)
         self._levels, self._views = gaussians.levels, gaussians.views
         self._camera = camera.to(gaussians.means)
         self._offsets = gaussians.means - self._camera
         distances = self._offsets.norm(dim=1).clamp_min(_MIN_DISTANCE)
         scales = torch.maximum(gaussians.scales, _MIN_SCALE * distances[:, None])
-        self._initial_log_scales = scales.log()
+        self._freedom = (_FREE_PARALLAX / (baseline or math.inf) * distances).clamp_max(1) ** 4
+        self._freedom += 0 if baseline else _LAYER_FREEDOM
         quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
         opacities = gaussians.opacities.clamp(_MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY)
         color, harmonics = gaussians.harmonics.split((1, gaussians.harmonics.shape[1] - 1), dim=1)
-        values = (torch.zeros_like(distances), self._initial_log_scales, quats, opacities.logit(), color, harmonics)
-        self.tensors = {
-            name: value.detach().clone().requires_grad_() for name, value in zip(self.NAMES, values, strict=True)
-        }
+        values = (torch.zeros_like(distances), scales.log(), quats, opacities.logit(), color, harmonics)
+        self._given = {name: value.detach() for name, value in zip(self.NAMES, values, strict=True)}
+        self.tensors = {name: value.clone().requires_grad_() for name, value in self._given.items()}
 
     def __len__(self) -> int:
         return len(self._levels)
@@ -94,28 +97,28 @@ class ViewParameters:
         halves = is_split[index].nonzero()[:, 0]
         self.tensors = {name: tensor.detach()[index].requires_grad_() for name, tensor in self.tensors.items()}
         self._levels, self._views = self._levels[index], self._views[index]
-        self._offsets, self._initial_log_scales = self._offsets[index], self._initial_log_scales[index]
+        self._given = {name: tensor[index] for name, tensor in self._given.items()}
+        self._offsets, self._freedom = self._offsets[index], self._freedom[index]
         longest, axis = self.tensors["scale"][halves].max(dim=1)
         axes = rotations_from_quats(self.tensors["rotation"][halves])
         shifts = _SPLIT_SHIFT * longest.exp()[:, None] * axes.take_along_dim(axis[:, None, None], dim=2)[:, :, 0]
         shifts[1::2] *= -1
         self._offsets[halves] += shifts
-        self.tensors["scale"][halves, axis] += math.log(_SPLIT_SCALE)
+        for tensors in (self.tensors, self._given):
+            tensors["scale"][halves, axis] += math.log(_SPLIT_SCALE)
 
     @torch.no_grad()
     def clamp(self) -> None:
-        """Keep the tensors in their ranges."""
-        self.tensors["distance"].clamp_(-_MAX_LOG_DISTANCE, _MAX_LOG_DISTANCE)
-        limits = self._initial_log_scales - _MAX_LOG_SCALE, self._initial_log_scales + _MAX_LOG_SCALE
-        self.tensors["scale"].clamp_(*limits)
-        bound = float(torch.tensor(_MAX_REFINED_OPACITY).logit())
-        self.tensors["opacity"].clamp_(-bound, bound)
+        """Keep the tensors in their bounds."""
+        for name, (decrease, increase) in _BOUNDS.items():
+            given, freedom = self._given[name], self._freedom.reshape(-1, *(1,) * (self._given[name].ndim - 1))
+            self.tensors[name].clamp_(given - decrease * freedom, given + increase * freedom)
 
 
 class CameraParameters:
-    """Gains of the photographs, and small corrections of their poses.
+    """Small corrections of the poses of the photographs.
 
-    Photograph t shows the colours of view v times exp(gain_t - gain_v). A corrected pose is the given pose times the
+    A corrected pose is the given pose times the
     exponential of a twist in camera axes: a rotation vector in radians, and a translation relative to the baseline.
 
     Args:
@@ -124,18 +127,12 @@ class CameraParameters:
     """
 
     def __init__(self, cam2world: Float[Tensor, "view 4 4"], *, correct_poses: bool) -> None:
-        self.cam2world = cam2world.double()
+        self.cam2world = cam2world.double().clone()  # no tensor of torch.inference_mode
         positions = self.cam2world[:, :3, 3]
         self._baseline = float(torch.pdist(positions).max()) if len(positions) > 1 else 0.0
-        self.log_gains = torch.zeros(len(cam2world), 3, device=cam2world.device, requires_grad=True)
         self.twists = torch.zeros(
             len(cam2world), 6, dtype=torch.float64, device=cam2world.device, requires_grad=correct_poses
         )
-
-    def gains(self, view: int | None, photograph: int) -> Float[Tensor, "3"]:
-        """Factors from the colours of a view to those of a photograph; None is the geometric mean of all."""
-        source = self.log_gains.mean(0) if view is None else self.log_gains[view]
-        return (self.log_gains[photograph] - source).exp()
 
     def pose_in_view(self, view: int | None, photograph: int) -> Float[Tensor, "4 4"]:
         """The corrected pose of a photograph relative to the corrected pose of a view, which keeps its given pose.

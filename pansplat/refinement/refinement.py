@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -27,15 +28,18 @@ from torch.nn import functional
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
-from pansplat.geometry.pose import nearest_views
+from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.pose import interpolate_poses, nearest_views
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.views import Views
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
+from pansplat.refinement.fusion import measure_cover
 from pansplat.refinement.objective import Photograph, image_difference
 from pansplat.refinement.parameters import LEARNING_RATES, CameraParameters, ViewParameters
 from pansplat.rendering import rasterize
-from pansplat.rendering.color_fit import count_steps, fit_colors
+from pansplat.rendering.color_fit import fit_colors
+from pansplat.rendering.gains import equalize_gaussians, equalize_images, measure_gains
 from pansplat.rendering.weights import compute_blending_weights
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
@@ -52,15 +56,13 @@ _BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at their own
 # size; it grows with the number of their pixels. Gaussians of little effect move less.
 _DAMPING = 0.2
-_STEPS_SHARE = 0.65  # of the time, that the steps take; the rest is the fit of colours (the sample on two cores)
+_STEPS_SHARE = 0.65  # of the progress, that the steps are; the rest is the fit of colours (the sample on two cores)
 _RATE_FLOOR = 0.05  # of the learning rates at the end
 _HOLD = 20.0  # weight of the mean squared change of the logarithms of distances
 _POSE_HOLD = 100.0  # weight of the squared corrections of poses, in radians and relative to the baseline
 _RELEASE = 0.75  # fraction of the run after which held-out blocks are fitted too
+_MAX_VEIL = 0.01  # of the sphere, that a refined scene may newly cover in front of the given one
 _SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
-# Of a timed run: with a limit of Gaussians (merged ones that are not fitted look like dots), and for each photograph in
-# joint drawing (few large steps leave the scene worse than before).
-_MIN_STEPS = 8
 _CHECK_EVERY = 10  # steps between checks of the held-out error
 _MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
 _PATIENCE = 3  # checks without a sufficient decrease
@@ -89,8 +91,8 @@ class RefineReport:
 
     Attributes:
         steps, seconds: of the run.
-        stopped: why it ended: "done", "converged", "interrupted", "worse" if the given scene is kept, or "single view",
-            which is not refined.
+        stopped: why it ended: "done", "converged", "interrupted", "time limit", "single view", which is not refined, or
+            why the given scene is kept: "worse", or "veiled" by what a path between the cameras shows in front of it.
         before: mean absolute error of the held-out blocks at the start, of the scene within the limit of Gaussians.
         after: the same before the last part of the run, which fits these blocks, or at the end of a run without it.
     """
@@ -126,6 +128,7 @@ class Refinement:
         seed: of the choice of held-out blocks.
     """
 
+    @torch.inference_mode(False)  # the parameters need gradients, whatever the mode of the caller
     def __init__(self, scene: Scene, views: Views, config: RefineConfig | None = None, *, seed: int = 0) -> None:
         _check_fit(scene, views)
         self.config = config or RefineConfig()
@@ -142,21 +145,25 @@ class Refinement:
         height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
         self._contribution_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
+        if limit is not None and len(scene.gaussians) > limit:
+            scene = merge_to(scene, self._contribution_size, limit)
+        self._start, poses = scene, scene.cam2world
+        self._log_gains = measure_gains(scene.gaussians, self._images, poses, compared, joint=scene.joint)
+        gaussians = equalize_gaussians(scene.gaussians, self._log_gains, poses)
+        if scene.joint:
+            self._start = dataclasses.replace(scene, gaussians=gaussians, gains=self.gains)
+        equal = equalize_images(self._images, self._log_gains)
         held_out = 0.0 if scene.joint else _HELD_OUT
         self._photographs = [
             Photograph.split(image, mask > 0.999, held_out, random)
-            for image, mask in zip(
-                self._shrink(self._images), self._shrink(compared[:, None].float())[:, 0], strict=True
-            )
+            for image, mask in zip(self._shrink(equal), self._shrink(compared[:, None].float())[:, 0], strict=True)
         ]
-        if limit is not None and len(scene.gaussians) > limit:
-            scene = merge_to(scene, self._contribution_size, limit)
-        self._created = time.perf_counter()
-        self._start, gaussians = scene, scene.gaussians
-        self._views = {
-            int(view): ViewParameters(gaussians.select(gaussians.views == view), scene.cam2world[int(view), :3, 3])
-            for view in torch.unique(gaussians.views)
-        }
+        self._views = {}
+        for view in torch.unique(gaussians.views).tolist():
+            near = nearest_views(poses, view, 1)
+            # Layers are free: blended with those of other views, they may hold what only their own photograph shows.
+            baseline = float((poses[near, :3, 3] - poses[view, :3, 3]).norm()) if scene.joint else 0.0
+            self._views[view] = ViewParameters(gaussians.select(gaussians.views == view), poses[view, :3, 3], baseline)
         self._layers = [
             _Layer((view,), (view, *nearest_views(scene.cam2world, view, MAX_OTHERS)), view) for view in self._views
         ]
@@ -175,7 +182,7 @@ class Refinement:
     def _group_parameters(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
         """All groups, and those of them that hold the Gaussians: one for each of `ViewParameters.NAMES`."""
         rates, betas = LEARNING_RATES, _POSE_BETAS if self.config.poses else _BETAS
-        groups = [ParameterGroup([self._cameras.log_gains], rates["gain"], betas)]
+        groups = []
         if self.config.poses:
             groups.append(ParameterGroup([self._cameras.twists], rates["pose"], betas))
         views = self._views.values()
@@ -183,6 +190,8 @@ class Refinement:
         of_views = [ParameterGroup([view.tensors[name] for view in views], rates[name], betas) for name in names]
         return groups + of_views, of_views
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()
     def step(self, fraction: float) -> None:
         """Rasterise and compare each view once, or in joint drawing all views, and move the Gaussians.
 
@@ -277,9 +286,8 @@ class Refinement:
         return errors * (gaussians.scales.amax(1) > math.pi / self._size[0] * distances)
 
     def _draw(self, gaussians: Gaussians, layer: _Layer, target: int) -> Tensor:
-        """The colours (3 height width) of a layer's Gaussians in a photograph, with its gain."""
-        color = rasterize(gaussians, self._cameras.pose_in_view(layer.source, target), size=self._size).color
-        return color if target == layer.source else color * self._cameras.gains(layer.source, target)[:, None, None]
+        """The colours (3 height width) of a layer's Gaussians in a photograph."""
+        return rasterize(gaussians, self._cameras.pose_in_view(layer.source, target), size=self._size).color
 
     @torch.no_grad()
     def held_out_error(self) -> float:
@@ -301,6 +309,20 @@ class Refinement:
         return error / weight if weight > 0 else 0.0
 
     @torch.no_grad()
+    def measure_veil(self) -> float:
+        """Largest share of the sphere that is newly covered in front of the given surfaces, between neighbours."""
+        largest, poses = 0.0, self._start.cam2world
+        for layer in self._layers:
+            given, refined = self._start.gaussians, self._build(layer)
+            if layer.source is not None:
+                given = given.select(given.views == layer.source)
+            pairs = {(view, *nearest_views(poses, view, 1)) for view in layer.views if len(poses) > 1}
+            for (view, other), fraction in itertools.product(sorted(pairs), (0.25, 0.5, 0.75)):
+                pose = interpolate_poses(poses[view], poses[other], fraction)
+                largest = max(largest, measure_cover(refined, given, pose) - measure_cover(given, given, pose))
+        return largest
+
+    @torch.no_grad()
     def scene(self) -> Scene:
         """The scene in its present state.
 
@@ -311,82 +333,80 @@ class Refinement:
             return self._result or self._start
         parts = [self._cameras.move(parameters.build(), view) for view, parameters in self._views.items()]
         poses = torch.stack([self._cameras.corrected_pose(view) for view in range(len(self._photographs))])
-        return dataclasses.replace(
-            self._start, gaussians=Gaussians.cat(parts), cam2world=poses.to(self._start.cam2world), gains=self.gains
-        )
+        gaussians, poses = Gaussians.cat(parts), poses.to(self._start.cam2world)
+        if not self._start.joint:  # the colours of a view are those of its photograph
+            gaussians = equalize_gaussians(gaussians, -self._log_gains, poses)
+        return dataclasses.replace(self._start, gaussians=gaussians, cam2world=poses, gains=self.gains)
 
     @property
     def gains(self) -> Gains:
-        """Factors of the photographs' channels relative to their geometric mean."""
-        logs = self._cameras.log_gains.detach()
-        return tuple(tuple(row) for row in (logs - logs.mean(0)).exp().tolist())
+        """Mean exposures of the photographs' channels relative to those of the joint colours."""
+        area = row_weights(self._log_gains.shape[-2]).to(self._log_gains)[:, None]
+        return tuple(tuple(row) for row in (-(self._log_gains * area).mean((2, 3)) / area.mean()).exp().tolist())
 
     @stage()
     def run(
         self,
         *,
-        seconds: float | None = None,
-        steps: int | None = None,
+        steps: int,
+        seconds: float = math.inf,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> RefineReport:
-        """Refine for a number of steps, or of seconds.
+        """Refine for a number of steps.
 
         The run goes over to its last part early if the held-out error stagnates. An object runs once. A single view is
         left as it is, within the limit of Gaussians.
 
         Args:
-            seconds: time limit since this object was made; the result depends on the speed of the machine. With a limit
-                of Gaussians, a run has at least 8 steps, and mergers do not count; in joint drawing it has 8 for each
-                photograph.
             steps: number of steps; the result is the same in every run on one machine.
+            seconds: after which the run ends early, in the middle of its plan: the result then depends on the machine.
             should_stop: checked before each step; True ends the run early, with the better of both scenes as always.
         """
-        min_steps = 0 if self.config.gaussians is None else _MIN_STEPS
-        if self._start.joint:
-            min_steps = _MIN_STEPS * len(self._photographs)
-        clock = _Clock(seconds, steps, self._created, min_steps)
+        if not (0 < steps < math.inf and seconds > 0):
+            raise InputError(f"`steps` and `seconds` of a refinement must be positive, got {steps} and {seconds}")
+        start, done, total = time.perf_counter(), 0, float(steps)
         if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
             self._result, error = self._start, self.held_out_error()
-            return RefineReport(0, clock.elapsed, "single view", error, error)
+            return RefineReport(0, time.perf_counter() - start, "single view", error, error)
 
         before = best = self.held_out_error()
         after: float | None = None  # measured when the release begins, which fits the held-out blocks
-        fastest, stale, stopped = math.inf, 0, "done"
-        while self._views and (fraction := clock.fraction) < 1:
-            if should_stop():
-                stopped = "interrupted"
+        stale, stopped = 0, "done"
+        while self._views and (fraction := done / total) < 1:
+            is_late = time.perf_counter() - start >= seconds
+            if is_late or should_stop():
+                stopped = "time limit" if is_late else "interrupted"
                 break
             report_progress("refining", _STEPS_SHARE * fraction)
             if after is None and fraction >= _RELEASE and not self._start.joint:
                 after = self.held_out_error()
             if after is not None and after > before:
                 break
-            start = clock.elapsed
             self.step(fraction)
-            clock.steps += 1
-            fastest = min(fastest, clock.elapsed - start)  # the first step of a process loads kernels
-            clock.reserve(self._end_cost() * fastest)
-            if self._start.joint or clock.steps % _CHECK_EVERY or clock.fraction >= _RELEASE:
+            done += 1
+            if self._start.joint or done % _CHECK_EVERY or done / total >= _RELEASE:
                 continue
             error = self.held_out_error()
             stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
             best = min(best, error)
             if stale >= _PATIENCE:
-                stopped, after = "converged", error
-                clock.shorten()
+                stopped, after, total = "converged", error, done / _RELEASE  # the last part begins now
         after = self.held_out_error() if after is None else after
+        if after <= before and self.measure_veil() > _MAX_VEIL:
+            stopped = "veiled"
+        elif after > before:
+            stopped = "worse"
+        is_kept = stopped in ("worse", "veiled")
         report_progress("fitting colours", _STEPS_SHARE)
-        self._result = self.scene() if after <= before else self._start
+        self._result = self._start if is_kept else self.scene()
         self._free_parameters()
-        if after <= before:
+        if not is_kept:
             detail = self._contribution_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
             self._result = drop_unseen(self._result, self._contribution_size, detail * DROP_ERROR)
-        else:
-            stopped = "worse"
-        if after <= before or self._start.joint:  # a fused scene has the colours of single photographs
+        if not is_kept or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)
         report_progress("refined", 1.0)
-        return RefineReport(clock.steps, clock.elapsed, stopped, before, after)
+        return RefineReport(done, time.perf_counter() - start, stopped, before, after)
 
     def _free_parameters(self) -> None:
         """Free the parameters and the optimiser's state, which are gigabytes for millions of Gaussians."""
@@ -395,73 +415,11 @@ class Refinement:
         self._groups.clear()
         self._view_groups.clear()
 
-    def _end_cost(self) -> float:
-        """Approximate duration of the contributions and the fit of colours, in steps."""
-        layers, photographs = len(self._layers), len(self._photographs)
-        views = photographs if self._start.joint else layers
-        others = sum(max(len(layer.photographs) - 1, 1) for layer in self._layers)
-        pixels = self._images[0, 0].numel() / math.prod(self._size)
-        # Durations relative to that of an image.
-        gradient = 1.7  # of a backward pass
-        weights, product = 1.2, 0.5  # of blending weights, and of a product with them
-        contributions = (others + views) * (weights + product)
-        steps = count_steps(self._images.shape[-2])
-        colors = views * pixels * (weights + product + 2 * steps * product)
-        return (contributions + colors) / (layers * (1 + gradient))
-
     def _finish(self, scene: Scene) -> Scene:
         """Fit the colours to the photographs at their own size."""
-        images = self._images
-        if scene.joint and scene.gains:
-            images = images / torch.tensor(scene.gains).to(images)[:, :, None, None]
+        images = equalize_images(self._images, self._log_gains) if scene.joint else self._images
         colors = fit_colors(scene.gaussians, images, scene.cam2world, self._masks, joint=scene.joint)
         return dataclasses.replace(scene, gaussians=colors)
-
-
-class _Clock:
-    """The completed fraction of a run, in steps or in seconds.
-
-    Args:
-        start: time from which seconds count, by `time.perf_counter`.
-        min_steps: of a timed run, which takes longer for them.
-    """
-
-    def __init__(self, seconds: float | None, steps: int | None, start: float, min_steps: int = 0) -> None:
-        limit = seconds if steps is None else steps
-        if limit is None or (seconds is not None and steps is not None):
-            raise InputError("give either `seconds` or `steps` of a refinement, got both or neither")
-        if not 0 < limit < math.inf:
-            raise InputError(f"`seconds` or `steps` of a refinement must be positive, got {limit}")
-        self._is_timed, self._given = steps is None, float(limit)
-        self._limit, self._is_shortened, self._reached = self._given, False, 0.0
-        self.steps, self._start, self._min_steps = 0, start, min_steps
-
-    def reserve(self, seconds: float) -> None:
-        """End a timed run earlier than its limit by this time, but not before half of it."""
-        if self._is_timed and not self._is_shortened:
-            self._limit = max(self._given - seconds, 0.5 * self._given)
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the start."""
-        return time.perf_counter() - self._start
-
-    @property
-    def _spent(self) -> float:
-        return self.elapsed if self._is_timed else float(self.steps)
-
-    @property
-    def fraction(self) -> float:
-        """Completed fraction of the run; it never falls."""
-        fraction = self._spent / self._limit
-        if self._is_timed and self.steps < self._min_steps:
-            fraction = min(fraction, self.steps / self._min_steps)
-        self._reached = max(self._reached, fraction)
-        return self._reached
-
-    def shorten(self) -> None:
-        """Begin the last part now, with a length in proportion to the time that was spent."""
-        self._limit, self._is_shortened = self._spent / _RELEASE, True
 
 
 def _cosine_fall(fraction: float) -> float:

@@ -33,8 +33,6 @@ EyeDistance = Annotated[float, Meta(gt=0, le=1)]
 """Distance of the eyes, metres."""
 Depth = Annotated[float, Meta(ge=1e-9, le=1e9)]
 """A distance, metres."""
-Seconds = Annotated[float, Meta(ge=0, le=1e6)]
-"""A time limit; 0 for none."""
 Minutes = Annotated[float, Meta(ge=0)]
 Fraction = Annotated[float, Meta(ge=0, lt=1)]
 Positive = Annotated[float, Meta(gt=0, le=1e9)]

@@ -40,13 +40,12 @@ def folder(tmp_path: Path, write_pair, sphere_predictor, monkeypatch: pytest.Mon
     monkeypatch.setitem(pipeline._MODELS, "default", DarkSphere)
     monkeypatch.setattr(bench, "warm_up", lambda predictor: None)
     monkeypatch.setattr(bench, "time_workload", lambda: 0.02)
-    cases = [RefineCase(CROSS_FADE, HEIGHT), RefineCase("default", HEIGHT), RefineCase("default", HEIGHT, 0.6)]
-    cases += [RefineCase("default", HEIGHT, 0.6, 40), RefineCase("default", HEIGHT, views=1)]
+    cases = [RefineCase(CROSS_FADE, HEIGHT), RefineCase("default", HEIGHT), RefineCase("default", HEIGHT, 30)]
+    cases += [RefineCase("default", HEIGHT, 30, 40), RefineCase("default", HEIGHT, views=1)]
     monkeypatch.setattr(bench, "list_refine_cases", lambda quick: cases)
     return tmp_path / "rooms"
 
 
-@pytest.mark.usefixtures("refinement_clock")
 def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     paths = [str(folder / name) for name in ("one", "two")]
@@ -60,7 +59,7 @@ def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path
     assert small["num_gaussians"] <= 40 < refined["num_gaussians"] < plain["num_gaussians"]
     assert single["num_gaussians"] == plain["num_gaussians"] // 2 and single["ws_psnr_db"] != plain["ws_psnr_db"]
     assert rows[11]["ws_psnr_db"] == pytest.approx((rows[1]["ws_psnr_db"] + rows[6]["ws_psnr_db"]) / 2, rel=1e-4)
-    assert "| default | 16 | all | 0.6 s | 40 |" in (out / "refine.md").read_text()
+    assert "| default | 16 | all | 30 steps | 40 |" in (out / "refine.md").read_text()
     assert (out / "refine.png").stat().st_size > 1000 and "cross-fade" in capsys.readouterr().out
 
 

@@ -28,7 +28,7 @@ from pansplat.model.weights import pack_weights, save_weights
 from pansplat.prediction_options import PredictOptions
 
 HEIGHT = 64
-SPHERE = PredictOptions("sphere", height=HEIGHT, refine_seconds=0.0)
+SPHERE = PredictOptions("sphere", height=HEIGHT, refine_steps=0)
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_only_what_is_not_up_to_date_is_made_and_takes_the_place_of_what_was(
     assert other_format["status"] == "done" and other_format["outputs"][0] == first["outputs"][0]
     assert {name: list_outputs(out)[name] for name in files} == files, "another format stays"
     write_pair(room, height=HEIGHT, seed=9)
-    for prediction in (SPHERE, PredictOptions("sphere", height=80, refine_seconds=0.0)):
+    for prediction in (SPHERE, PredictOptions("sphere", height=80, refine_steps=0)):
         again = process(room, out, "predict,export", format="spz", prediction=prediction)
         kept = {*again["outputs"], other_format["outputs"][1], "room0/notes.txt"}
         assert again["status"] == "done" and set(list_outputs(out)) == kept, "what it replaces goes"
@@ -183,9 +183,9 @@ def test_the_export_of_a_refined_scene_is_refined(rooms: Path, tmp_path: Path, s
         do: Batch(rooms, tmp_path, do=do).list_exports(rooms / "room0") for do in ("export", "predict,refine,export")
     }
     limits = [
-        {name.split("-")[0]: e.prediction.options.refine_seconds for name, e in each.items()} for each in steps.values()
+        {name.split("-")[0]: e.prediction.options.refine_steps for name, e in each.items()} for each in steps.values()
     ]
-    assert limits == [{"export": 0.0}, {"predict": 0.0, "refine": None, "export": None}]
+    assert limits == [{"export": 0}, {"predict": 0, "refine": None, "export": None}]
 
 
 def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path, sphere: None) -> None:

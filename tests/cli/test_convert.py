@@ -72,7 +72,7 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room, sm
         assert image.height == 16 and len(set(image.convert("L").getextrema())) == 2
     run_on_room("evaluate", tmp_path / "results", "--height", "64", "--compat", "fixed")
     assert (tmp_path / "results" / "results.json").exists()
-    options = PredictOptions(str(weights), "fixed", height=64, refine_seconds=0)
+    options = PredictOptions(str(weights), "fixed", height=64, refine_steps=0)
     (entry,) = (entry for entry in find_entries(room, ReadOptions(), options) if entry.pair is not None)
     viewed = load_entry(entry, options).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)

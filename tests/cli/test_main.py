@@ -123,7 +123,7 @@ REFUSED = {
     "predict room -o x.ply --near 9 --far 3": "0 < near < far",
     "predict room -o x.ply --convention sideways": "needed a known pose convention",
     "predict room -o x.ply --model sphere --precision bfloat16": "`precision` is for networks, and sphere is not one",
-    "refine room -o x.ply --seconds 1 --steps 3": "--seconds and --steps both",
+    "refine room -o x.ply --seconds 0": "--seconds: needed a number > 0",
     "refine room -o x.ply --photographs elsewhere": "--photographs is for a scene file",
     "refine room -o x.ply --model sphere --poses": "add --layers",
     "refine scene.ply -o x.ply": "give the folder of its pair with --photographs",

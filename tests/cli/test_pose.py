@@ -24,7 +24,7 @@ from pansplat_viewer.scene.loader import find_entries
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
-SPHERE = PredictOptions("sphere", height=64, refine_seconds=0.0, cache=False)
+SPHERE = PredictOptions("sphere", height=64, refine_steps=0, cache=False)
 
 
 def _photograph(seed: int) -> np.ndarray:

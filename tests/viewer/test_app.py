@@ -105,7 +105,7 @@ def test_offscreen_writes_the_fly_through_to_the_given_folder(room):
 def test_verbose_says_what_runs_where(write_room, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     arguments = ["--offscreen", "out", "--renderer", "cpu", "--size", "32x32", "--seconds", "0.1"]
-    arguments += [str(write_room(tmp_path / "pair")), "--height", "64", "--model", "sweep", "--refine", "0.5"]
+    arguments += [str(write_room(tmp_path / "pair")), "--height", "64", "--model", "sweep", "--refine", "2"]
     assert run([*arguments, "--verbose"]) == 0
     printed = capsys.readouterr().err
     assert "note: drawing: on the processor\n" in printed and "note: refinement: on the processor\n" in printed

@@ -233,7 +233,7 @@ def _load_tour_scene(
         if show is None:
             views = part
         elif views != part:
-            prediction = replace(prediction, refine_seconds=0.0)
+            prediction = replace(prediction, refine_steps=0)
         entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
     pair = entry.pair or tour.make_pair(views)
     fitted = pipeline.fit_to_scene(prediction, pair)
@@ -246,7 +246,7 @@ def _load_tour_scene(
         pair,
         pipeline.choose_predictor(pair, predictor),
         options=fitted,
-        on_predicted=None if show is None or not fitted.refine_seconds else lambda s: show(finish(s, is_final=False)),
+        on_predicted=None if show is None or fitted.refine_steps == 0 else lambda s: show(finish(s, is_final=False)),
     )
     return finish(scene, is_final=True)
 

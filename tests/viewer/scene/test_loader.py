@@ -116,7 +116,7 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
 
     def predict(pair, model, *, options, on_predicted):
         views = tuple(int(view.name[-1]) for view in pair.context)
-        asked.append((views, options.refine_seconds, on_predicted is not None))
+        asked.append((views, options.refine_steps, on_predicted is not None))
         return load_house(TourScenes(house).make_entry(views)).scene
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
@@ -126,8 +126,8 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
     request = scenes.choose_request(scenes.list_next(None, 0.0), SceneEntry("house", tour=house))
     assert request.views == (0, 1, 2, 3)
     part = load_entry(request, PredictOptions(), lambda loaded: None)
-    assert asked[0] == ((0, 1, 2), 0.0, False), "the first scene is not refined"
-    assert asked[1] == ((0, 1, 2, 3), pytest.approx(10.0 * 4 / 3), True)
+    assert asked[0] == ((0, 1, 2), 0, False), "the first scene is not refined"
+    assert asked[1] == ((0, 1, 2, 3), None, True)
     assert part.entry.views == request.views and set(part.facts.outlines) <= set(request.views)
     film = load_entry(SceneEntry("house", tour=house), PredictOptions())
     assert film.entry.views == (0, 1, 2, 3), "a film needs all, so that nothing is predicted twice"
@@ -208,7 +208,7 @@ def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
 
 
 def test_a_prediction_has_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):
-    options = PredictOptions("sweep", height=256, cache=False, refine_seconds=3.0)
+    options = PredictOptions("sweep", height=256, cache=False, refine_steps=3)
 
     def predict(pair, **arguments):
         assert arguments["options"] is options
