@@ -299,3 +299,9 @@ def small_config() -> Any:
         ),
         heads=HeadsConfig(feature_channels=(16, 8, 8, 4), candidates=4, adapter=AdapterConfig(degree=1)),
     )
+
+
+@pytest.fixture
+def any_veil(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A refinement is kept whatever it covers: spheres around random images are not what a veil could hide."""
+    monkeypatch.setattr("pansplat.refinement.refinement._MAX_VEIL", 1.0)

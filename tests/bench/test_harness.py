@@ -20,8 +20,13 @@ CPU = torch.device("cpu")
 @pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark is Linux's")
 def test_peak_memory_is_the_memory_that_the_call_holds_at_once():
     before = np.ones(50_000_000, np.uint8)
-    peak, total = measure_peak_memory(lambda: sum(map(np.sum, [np.ones(10_000_000, np.uint8) for _ in range(6)])), CPU)
-    assert total == 60_000_000 and 58 <= peak["peak_mb"] <= 80  # other threads may allocate a little
+
+    def hold() -> int:
+        return sum(map(np.sum, [np.ones(10_000_000, np.uint8) for _ in range(6)]))
+
+    # Other threads may allocate a little, and the kernel of a busy machine may take back other pages meanwhile.
+    peaks, totals = zip(*(measure_peak_memory(hold, CPU) for _ in range(3)), strict=True)
+    assert set(totals) == {60_000_000} and 58 <= max(peak["peak_mb"] for peak in peaks) <= 80
     del before  # held during the call
 
 

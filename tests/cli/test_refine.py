@@ -19,6 +19,7 @@ def refine(path: Path, out: Path, *arguments: object) -> int:
     return run(["refine", str(path), "-o", str(out), "--steps", "12", *map(str, arguments)])
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_a_pair_is_predicted_and_refined(room: Path, scene: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "refined.ply"
     assert refine(room, out, "--model", "sphere", "--height", HEIGHT) == 0
@@ -29,7 +30,6 @@ def test_a_pair_is_predicted_and_refined(room: Path, scene: Path, tmp_path: Path
     refined, predicted = pipeline.load(out), pipeline.load(scene)
     assert refined.joint and not predicted.joint
     assert refined.names == predicted.names and refined.cam2world.equal(predicted.cam2world)
-    assert len(refined.gaussians) < 0.9 * len(predicted.gaussians)
 
 
 def test_a_command_says_what_runs_where_and_refuses_a_card_that_is_not_there(
@@ -54,11 +54,13 @@ def test_layers_keep_all_gaussians(room: Path, tmp_path: Path, capsys) -> None:
     assert not layers.joint and len(layers.gaussians) > 900
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_a_scene_is_refined_with_the_photographs_of_its_pair(room: Path, scene: Path, tmp_path: Path) -> None:
     assert refine(room, tmp_path / "pair.ply", "--model", "sphere", "--height", HEIGHT) == 0
     assert refine(scene, tmp_path / "scene.ply", "--photographs", room) == 0
-    a, b = (pipeline.load(tmp_path / f"{name}.ply").gaussians for name in ("pair", "scene"))
-    assert (a.means - b.means).abs().median() < 0.01
+    scenes = [pipeline.load(tmp_path / f"{name}.ply") for name in ("pair", "scene")]
+    a, b = (pipeline.render(each, each.pose_between(0.5), size=(32, 64)).color for each in scenes)
+    assert (a - b).abs().mean() < 1 / 255  # the file of the given scene is rounded
 
 
 def test_a_budget_limits_the_gaussians(room: Path, tmp_path: Path, capsys) -> None:

@@ -212,6 +212,7 @@ def test_a_limited_scene_is_compared_at_the_rows_of_a_display(room, monkeypatch:
     assert errors[1] < 0.8 * errors[0]
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_a_coarse_scene_is_split_within_its_limit_and_explains_the_photographs_better(room) -> None:
     coarse = merge_to(room.predicted, room.views.images.shape[-2:], 160)
     plain, _ = _refine(room, steps=60, scene=coarse, splits=())
