@@ -14,8 +14,9 @@ import scipy
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
-from pansplat.geometry.equirect import rotate_equirect, row_weights
+from pansplat.geometry.equirect import pad_equirect, pixel_directions, rotate_equirect, row_weights
 from pansplat.geometry.pose import blend_weights
 
 _SSIM_SIGMA = 1.5  # pixels
@@ -111,3 +112,33 @@ def cross_fade(
     for image, pose, weight in zip(images, poses, weights, strict=True):
         faded += weight * rotate_equirect(image, pose[:3, :3].T @ target[:3, :3])
     return faded
+
+
+def distortion(
+    inverse_depth: Float[Tensor, "height width"], offset: Float[Tensor, "3"], ahead: Float[Tensor, "3"]
+) -> tuple[float, float]:
+    """Shares of a moved camera's picture, ahead and aside, where a view's surface is torn (docs/evaluation.md).
+
+    They are from 0 to 1, NaN if nothing counts.
+
+    Args:
+        inverse_depth: of the surface, radial; NaN where there is none: pixels beside these do not count.
+        offset, ahead: place of the moved camera, and direction of the flight, in the view's axes.
+    """
+    height, width = inverse_depth.shape
+    rays, step, weights = pixel_directions(height, width, dtype=torch.float64), math.pi / height, row_weights(height)
+    moved = functional.normalize(rays - inverse_depth.double()[..., None] * offset.double(), dim=-1).permute(2, 0, 1)
+    padded = pad_equirect(moved, 1)
+    east, south = padded[:, 1:-1, 2:] - moved, padded[:, 2:, 1:-1] - moved
+    jacobian = torch.stack((east / weights[:, None], south)) / step
+    radius = max(round(math.radians(1) / step), 1)
+    padded = pad_equirect(jacobian, radius)
+    padded[..., (*range(radius), *range(-radius, 0)), :] *= -1  # beyond a pole, east and south are opposite
+    mean = functional.avg_pool2d(padded, 2 * radius + 1, stride=1)
+    torn = (jacobian - mean).square().sum((0, 1)) > 0.3**2 * mean.square().sum((0, 1))
+    area = (torch.linalg.cross(mean[0], mean[1], dim=0).norm(dim=0) * weights[:, None]).nan_to_num()
+    x, _, z = functional.normalize(ahead.double() * torch.tensor((1.0, 0.0, 1.0)), dim=0).tolist()
+    cosines = x * moved[0] + z * moved[2], (z * moved[0] - x * moved[2]).abs()
+    seen = area * (torch.stack(cosines) > math.cos(math.radians(40)))
+    around_ahead, around_sides = ((seen * torn).sum((1, 2)) / seen.sum((1, 2))).tolist()
+    return around_ahead, around_sides

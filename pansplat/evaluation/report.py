@@ -5,6 +5,7 @@ Source: PanSplat, section 4 (metrics of the views between the inputs).
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,15 +22,16 @@ from torch import Tensor
 from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.evaluation.lpips import Lpips
-from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
+from pansplat.evaluation.metrics import cross_fade, distortion, psnr, ssim, ws_psnr
 from pansplat.evaluation.results import Column, Row, average_rows, make_folder, rich_table, write_json
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
 from pansplat.inputs.pairs import Pair
-from pansplat.inputs.views import Views
+from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor
-from pansplat.rendering import Rendering
+from pansplat.refinement.fusion import BACKGROUND_LEVEL, OPAQUE
+from pansplat.rendering import Rendering, rasterize
 from pansplat.system.progress import report_progress, stage
 
 _CROSS_FADE = {  # metrics of the cross-fade, by those of the prediction
@@ -55,7 +57,7 @@ def evaluate(
 
     The case of a row has the name, the model, the height, and the paths of the images. Its values are those of
     `measure_image`; `own_ws_psnr`, the mean at the input cameras over unmasked pixels; `masked_ws_psnr` of the unmasked
-    pixels, if the target has a mask; the same metrics of the cross-fade; times in seconds; and the number of Gaussians.
+    pixels, if the target has a mask; the same metrics of the cross-fade; `distortion`; times in seconds; and counts.
 
     For correct times, predictions are not read from the cache and the predictor runs once before the first pair.
     results.json is written after each pair, so that an interruption keeps the results so far.
@@ -139,6 +141,7 @@ def _evaluate_pair(
             {
                 **measure_image(image, target, lpips, mask),
                 **{new: faded_values[old] for old, new in _CROSS_FADE.items() if old in faded_values},
+                **measure_distortion(scene, pose[:3, 3]),
                 "own_ws_psnr": own_ws_psnr,
                 "predict_seconds": predict_seconds,
                 "refine_seconds": refine_seconds,
@@ -173,6 +176,26 @@ def measure_own_views(scene: Scene, context: Views, render: Callable[[Scene, Ten
     return fmean(values)
 
 
+@torch.no_grad()
+def measure_distortion(scene: Scene, position: Float[Tensor, "3"]) -> dict[str, float]:
+    """`distortion` at a position, the mean of the two nearest input cameras; no entry for what is not defined."""
+    places = scene.cam2world[:, :3, 3]
+    nearest = (places - position).norm(dim=1).argsort(stable=True)[:2].tolist()
+    if len(nearest) < 2 or float((places[nearest[0]] - places[nearest[1]]).norm()) < ONE_POSITION * scene.near:
+        return {}
+    height, shares = min(scene.height, 256), []
+    for view, other in (nearest, nearest[::-1]):
+        # The background shines through: depth with it is not that of the surface.
+        is_surface = (scene.gaussians.views == view) & (scene.gaussians.levels < BACKGROUND_LEVEL)
+        pose = scene.cam2world[view]
+        drawn = rasterize(scene.gaussians.select(is_surface), pose, size=(height, 2 * height))
+        inverse_depth = torch.where(drawn.alpha > OPAQUE, 1 / drawn.depth, torch.nan)
+        offset, ahead = ((place - pose[:3, 3]) @ pose[:3, :3] for place in (position, places[other]))
+        shares.append(distortion(inverse_depth, offset, ahead))
+    means = zip(("distortion_ahead", "distortion_aside"), torch.tensor(shares).nanmean(dim=0).tolist(), strict=True)
+    return {name: mean for name, mean in means if not math.isnan(mean)}
+
+
 def error_image(
     prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "3 height width"]:
@@ -192,13 +215,16 @@ _COLUMNS = (
     Column("SSIM", "ssim", ".4f"),
     Column("LPIPS", "lpips", ".4f"),
     Column("cross-fade", "cross_fade_ws_psnr", ".2f"),
+    Column("torn ahead", "distortion_ahead", ".3f"),
+    Column("torn aside", "distortion_aside", ".3f"),
     Column("at inputs", "own_ws_psnr", ".2f"),
     Column("predict s", "predict_seconds", ".1f"),
     Column("refine s", "refine_seconds", ".1f"),
     Column("render s", "render_seconds", ".1f"),
     Column("Gaussians", "num_gaussians", ",.0f"),
 )
-_OPTIONAL = ("masked_ws_psnr", "lpips", "refine_seconds")  # columns without values, or with zeros only, are left out
+# Columns that are left out without values, or with zeros only.
+_OPTIONAL = ("masked_ws_psnr", "lpips", "refine_seconds", "distortion_ahead", "distortion_aside")
 
 
 def results_table(rows: Sequence[Row]) -> Table:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pansplat.evaluation.metrics import cross_fade, psnr, ssim, ws_psnr
+from pansplat.evaluation.metrics import cross_fade, distortion, psnr, ssim, ws_psnr
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.geometry.pose import rotations_from_quats
 
@@ -114,3 +114,45 @@ def test_the_cross_fade_weights_inputs_by_distance() -> None:
     for place in (0.0, 0.25):
         faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(place))
         torch.testing.assert_close(faded, torch.full((3, 8, 16), place), atol=1e-5, rtol=0)
+
+
+ROWS = 256
+SPHERE = torch.full((ROWS, 2 * ROWS), 0.5, dtype=torch.float64)  # inverse depth at 2 m
+RAYS = pixel_directions(ROWS, 2 * ROWS, dtype=torch.float64)
+AHEAD = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
+HALF = 0.5 * AHEAD
+
+
+def tear(jump: float) -> torch.Tensor:
+    """The sphere with blocks of 8 x 8 pixels at random distances, up to `jump` of theirs nearer or farther."""
+    blocks = torch.rand(ROWS // 8, ROWS // 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return SPHERE * (1 + jump * (2 * blocks - 1)).repeat_interleave(8, 0).repeat_interleave(8, 1)
+
+
+def test_smooth_surfaces_and_planes_are_not_distorted() -> None:
+    assert max(distortion(SPHERE, HALF, AHEAD)) < 1e-3
+    assert max(distortion(SPHERE, torch.tensor((0.3, 1.2, 0.1)), AHEAD)) < 1e-3  # towards a pole
+    wall = (RAYS @ AHEAD / 2).clamp(min=1e-3)
+    assert distortion(wall, HALF, AHEAD)[0] < 1e-3  # its edge is 90 degrees from ahead
+
+
+def test_distortion_grows_with_tears_and_is_zero_without_motion() -> None:
+    ahead, aside = zip(*(distortion(tear(jump), HALF, AHEAD) for jump in (0, 0.05, 0.2, 0.6)), strict=True)
+    assert list(ahead) == sorted(ahead) and ahead[-1] > 0.1 and list(aside) == sorted(aside) and aside[1] > 0.1
+    assert all(wide > narrow for wide, narrow in zip(aside[1:], ahead[1:], strict=True))  # parallax is larger there
+    assert max(distortion(tear(0.6), 0 * HALF, AHEAD)) < 1e-3
+
+
+def test_distortion_turns_with_the_axes_and_is_counted_near_the_direction_of_the_flight() -> None:
+    torn, offset = tear(0.3), torch.tensor((0.1, -0.05, 0.4), dtype=torch.float64)
+    turned = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)), dtype=torch.float64)  # a quarter to the right
+    rolled = distortion(torn.roll(ROWS // 2, dims=1), turned @ offset, turned @ (AHEAD + 3 * offset))
+    assert rolled == pytest.approx(distortion(torn, offset, AHEAD + 3 * offset), abs=1e-9)
+    half = torch.where(RAYS[..., 2] > 0.7, torn, SPHERE)
+    assert distortion(half, 0.2 * AHEAD, AHEAD)[0] > 0.01 > distortion(half, 0.2 * AHEAD, AHEAD)[1]
+
+
+def test_places_without_surface_do_not_count() -> None:
+    holes = torch.where(RAYS[..., 0] > 0, torch.nan, SPHERE)
+    assert max(distortion(holes, HALF, AHEAD)) < 1e-3
+    assert all(map(math.isnan, distortion(torch.full_like(SPHERE, torch.nan), HALF, AHEAD)))

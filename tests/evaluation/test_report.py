@@ -1,5 +1,6 @@
 """The evaluation of pairs: its files, metrics and table."""
 
+import dataclasses
 import functools
 import io
 import json
@@ -20,6 +21,7 @@ from pansplat.evaluation.lpips import Lpips
 from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.evaluation.report import evaluate, results_table
 from pansplat.evaluation.results import Row
+from pansplat.gaussians.scene import Gaussians
 from pansplat.inputs.folders import load_pairs
 from pansplat.training.sequences import BoundedSampler
 
@@ -27,6 +29,7 @@ HEIGHT = 16
 KEYS = [
     *("software", "name", "model", "height", "ws_psnr", "psnr", "ssim", "cross_fade_ws_psnr", "predict_seconds"),
     *("render_seconds", "num_gaussians", "prediction", "target", "own_ws_psnr", "refine_seconds"),
+    *("distortion_ahead", "distortion_aside"),
 ]
 
 
@@ -118,6 +121,27 @@ def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(
     (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert set(result) == {*KEYS, "masked_ws_psnr", "masked_cross_fade_ws_psnr"}
     assert "unmasked" in [str(column.header) for column in results_table([case]).columns]
+
+
+@pytest.mark.filterwarnings("ignore:a, b. the cameras are at one place")
+def test_torn_surfaces_are_columns_and_cameras_at_one_place_have_none(
+    folder: Path, case: Row, tmp_path: Path, write_triplet: Callable[..., Path], sphere_predictor: type
+) -> None:
+    class TornPredictor(sphere_predictor):  # every second block is nearer
+        def __call__(self, images: Tensor, cam2world: Tensor, *arguments, **options) -> Gaussians:
+            found = super().__call__(images, cam2world, *arguments, **options)
+            eyes = cam2world[found.views.long(), :3, 3].float()
+            factor = 1 + 0.4 * torch.sin(5 * (found.means - eyes)).sign().prod(dim=1, keepdim=True)
+            return dataclasses.replace(found, means=eyes + factor * (found.means - eyes))
+
+    (torn,) = evaluate(load_pairs(folder / "room"), TornPredictor(), tmp_path / "torn", height=64)
+    assert torn.get("distortion_aside") > 0.02 > 1e-3 > case.get("distortion_aside")
+    headings = [str(column.header) for column in results_table([torn]).columns]
+    assert "torn aside" in headings
+    pairs = load_pairs(write_triplet(tmp_path / "room", baseline=0.0))
+    (still,) = evaluate(pairs, TornPredictor(), tmp_path / "still", height=64)
+    assert still.get("distortion_ahead") is None is still.get("distortion_aside")
+    assert "torn aside" not in [str(column.header) for column in results_table([still]).columns]
 
 
 def test_lpips_is_optional(folder: Path, tmp_path: Path, sphere_predictor: type) -> None:
