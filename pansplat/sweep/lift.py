@@ -4,7 +4,7 @@ Levels 0 and 1 are discs on the surface, with gaps at depth discontinuities; lev
 lose image detail. Where a large panorama has detail that a lattice of half its height would lose, finer lattices
 replace the points of level 0. Levels 2 and 3 are a closed background layer slightly behind the surface: at every
 discontinuity it continues the far side, so that a moving camera sees no holes. Points in the consistent free
-space of more other views than confirm them move back to the background, or are removed.
+space of more other views than confirm them are removed.
 
 Source: PanSplat, section 3.3 (lattices and levels).
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -42,7 +42,6 @@ from pansplat.sweep.surface import (
     pad_sphere,
     resize_mask,
     resize_sphere,
-    world_points,
 )
 
 _Lattice = tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]
@@ -92,7 +91,6 @@ def lift(posed: PosedImages, surfaces: list[Surface], neighbours: Sequence[Seque
     views = range(len(surfaces))
     consistent = [consistency_mask(surfaces, posed.cam2world, view, neighbours[view]) for view in views]
     scene = _PosedSurfaces(posed, surfaces, neighbours, consistent)
-    scene = replace(scene, surfaces=[_remove_inconsistent(scene, view) for view in views])
     fine = [_choose_fine_pixels(image, heights) for image in photographs]
     parts = []
     for level in range(NUM_LEVELS):
@@ -125,16 +123,6 @@ class _PosedSurfaces:
     surfaces: list[Surface]
     neighbours: Sequence[Sequence[int]]
     consistent: list[np.ndarray]
-
-
-def _remove_inconsistent(scene: _PosedSurfaces, view: int) -> Surface:
-    """The surface, with the points in other views' consistent free space moved back to the background layer."""
-    surface = scene.surfaces[view]
-    points = world_points(surface, scene.posed.cam2world[view]).reshape(-1, 3)
-    _, kept = _estimate_opacity(points, scene, view)
-    far = _background_inverse_depth(surface.inverse_depth, scene.posed.masks[view], 2)
-    behind = np.minimum(surface.inverse_depth, resize_sphere(far, surface.height))
-    return Surface(np.where(kept.reshape(behind.shape), surface.inverse_depth, behind))
 
 
 def _lattice_heights(height: int, surface_height: int) -> list[int]:
