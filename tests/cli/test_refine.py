@@ -82,6 +82,7 @@ def test_a_single_view_is_written_as_it_is(room: Path, tmp_path: Path, capsys, m
     assert len(pipeline.load(tmp_path / "few.ply").gaussians) <= 100
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     from pansplat.refinement import Refinement
 
