@@ -117,6 +117,7 @@ def gray_pair(pair_folder: Path) -> Path:
     return pair_folder
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_a_refined_scene_is_cached_apart_from_its_prediction(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,6 +132,7 @@ def test_a_refined_scene_is_cached_apart_from_its_prediction(
     assert len(list((gray_pair / ".pansplat").iterdir())) == 2
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_a_refinement_is_the_same_however_busy_the_machine_is(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -134,7 +134,7 @@ SIZES = [
     Fault("render --stereo of a perspective image", "render scene.ply --stereo --layout perspective -o x.png", says="--stereo is for"),
     *(Fault(f"view {options}", f"pansplat-view scene.ply {options}", says=says) for options, says in (
         ("--size 4x4", "WIDTHxHEIGHT"), ("--size huge", "WIDTHxHEIGHT"), ("--at 1.5", "--at: needed a number <= 1"), ("--pair kitchen", "number from 1 to 1 or one of scene"),
-        ("--path no.json", "no.json"), ("--refine -1", "--refine: needed a number >= 0"))),
+        ("--path no.json", "no.json"), ("--refine -1", "--refine: needed a whole number >= 0"))),
     Fault("view: a scene that is missing", "pansplat-view nowhere", says="no such file or folder"),
     *(Fault(f"train {options}", f"pansplat-train {options} --device cpu --data.workers 0 --perceptual structure", says=says) for options, says in (
         ("tiny --out run --data.kind triplets", "--data.kind triplets needs --data.root"), ("small", "needs --data.root"),
