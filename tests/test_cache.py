@@ -112,8 +112,10 @@ def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> Non
 @pytest.fixture
 def gray_pair(pair_folder: Path) -> Path:
     """Photographs of different exposure, which a refinement finds."""
-    for name, gray in (("left.png", 90), ("right.png", 140)):
-        Image.new("L", (2 * HEIGHT, HEIGHT), gray).convert("RGB").save(pair_folder / name)
+    pattern = np.random.default_rng(0).uniform(0.5, 1, (4, 8))
+    for name, brightest in (("left.png", 150), ("right.png", 240)):
+        small = Image.fromarray((brightest * pattern).astype(np.uint8)).convert("RGB")
+        small.resize((2 * HEIGHT, HEIGHT), Image.Resampling.BICUBIC).save(pair_folder / name)
     return pair_folder
 
 
@@ -179,6 +181,7 @@ def test_one_content_has_one_entry_whatever_names_and_paths_are(pair_folder: Pat
     assert scenes[3].names == ("客厅", "right") and scenes[3].model == other.name
 
 
+@pytest.mark.usefixtures("any_veil")
 def test_a_cached_scene_is_opened_without_its_photographs(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
