@@ -25,7 +25,7 @@ from pansplat.rendering import rasterize
 
 _HEIGHT = 512  # rows of the depth of a view's surface
 _COVER_HEIGHT = 64  # rows of the images of `measure_cover`
-_FRONT = 0.85  # of the distance of a surface: what is nearer is in front of it
+_FRONT = 0.85  # largest ratio of the distances of a Gaussian and of the surface that it is in front of
 _TOLERANCE = 0.1  # of a distance from the surface, relative to its depth
 BACKGROUND_LEVEL = 2  # the finest level of the background
 OPAQUE = 0.5  # least alpha of a surface

@@ -118,8 +118,8 @@ class ViewParameters:
 class CameraParameters:
     """Small corrections of the poses of the photographs.
 
-    A corrected pose is the given pose times the
-    exponential of a twist in camera axes: a rotation vector in radians, and a translation relative to the baseline.
+    A corrected pose is the given pose times the exponential of a twist in camera axes: a rotation vector in radians,
+    and a translation relative to the baseline.
 
     Args:
         cam2world: given poses, metres.

@@ -21,13 +21,13 @@ from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equ
 from pansplat.rendering.rasterize import rasterize
 
 _HEIGHT = 64  # rows of the images whose colours are compared
-_ROWS = 32  # of the grid of gains, 5.6 degrees each
+_ROWS = 32  # rows of the grid of gains; each is 5.6 degrees high
 # Standard deviations of the kernel, radians, and weights: the wider parts count where little agrees near a place.
 _KERNEL = ((math.radians(8), 1.0), (math.radians(32), 1e-2), (math.pi, 1e-4))
-_TOLERANCE = 0.05  # of the logarithm of a distance, between surfaces that agree
-_MIN_COLOR, _MAX_COLOR = 0.02, 0.98  # of colours that are compared: others are clipped
-_OUTLIER = 0.1  # difference of logarithms, from which on a place counts less
-_ROUNDS = 4  # of reweighted least squares
+_TOLERANCE = 0.05  # largest difference of log-distance of surfaces that agree
+_MIN_COLOR, _MAX_COLOR = 0.02, 0.98  # limits of colours that are compared; a camera clips those beyond
+_OUTLIER = 0.1  # difference of log-colours from the smooth gain that halves the weight of a place
+_ROUNDS = 4  # rounds of reweighted least squares
 
 
 @torch.no_grad()

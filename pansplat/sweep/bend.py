@@ -133,4 +133,5 @@ def _couple(target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray) -> 
         jumps, field_jumps, _ = np.abs(following - lines)
         field_jumps = np.maximum(field_jumps - _SLOPE, 0) * np.minimum(lines[2], following[2])
         couplings.append(np.exp(-(jumps + field_jumps) / _DISCONTINUITY))
-    return couplings[0], couplings[1]
+    rows, meridians = couplings
+    return rows, meridians

@@ -14,7 +14,7 @@ from pansplat.geometry.equirect import row_weights
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 
 _PASSES = 2  # over rows and meridians
-_MAX_ROW_COUPLING = 1e3  # of neighbouring pixels in a row, which are close to each other at the poles
+_MAX_ROW_COUPLING = 1e3  # largest factor of the couplings of a row, whose pixels are close to each other at the poles
 
 
 def as_meridians(maps: np.ndarray) -> np.ndarray:
@@ -70,7 +70,7 @@ def _smooth_line(maps, couplings, strength, line):
     first, second = maps[0, line], maps[1, line]
     corner = -strength * coupling[length - 1]
     gamma = -(1 + strength * (coupling[length - 1] + coupling[0]))
-    inverse = -0.5 / gamma  # of the pivot
+    inverse = -0.5 / gamma  # 1 / the first pivot, which is -2 gamma
     upper[0], turn[0] = -strength * coupling[0] * inverse, -0.5
     first[0] *= inverse
     second[0] *= inverse

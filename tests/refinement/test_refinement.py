@@ -129,7 +129,7 @@ def test_a_scene_that_gets_worse_is_returned_unchanged(room, monkeypatch) -> Non
 def test_what_parallax_shows_keeps_its_shape_and_nothing_becomes_much_more_opaque(room) -> None:
     offsets = room.predicted.gaussians.means - room.predicted.cam2world[room.predicted.gaussians.views, :3, 3].float()
     changes = []
-    for baseline in (0.6, 6.0):  # of the same photographs, which then contradict the scene
+    for baseline in (0.6, 6.0):  # metres; the photographs stay, and contradict the scene of the second
         poses = room.predicted.cam2world.clone()
         poses[:, :3, 3] *= baseline / 0.6
         means = offsets + poses[room.predicted.gaussians.views, :3, 3].float()

@@ -22,7 +22,7 @@ def make_views(exposure: float, occluder: bool = False):
     fields = torch.stack((torch.zeros(HEIGHT, 2 * HEIGHT), exposure * rays[..., 0].float() - 0.1))[:, None]
     images = 0.4 * fields.exp().expand(-1, 3, -1, -1)
     masks = torch.ones(2, HEIGHT, 2 * HEIGHT, dtype=torch.bool)
-    if occluder:  # of another colour in the second photograph only: its depth does not agree
+    if occluder:  # a box of another colour in the second photograph only, whose depth does not agree
         images, depths = images.clone(), depths.clone()
         images[1, :, 20:40, 30:60], depths[1, 20:40, 30:60] = 0.9, 1.0
     return images, depths, poses, masks
@@ -45,7 +45,7 @@ def test_a_smooth_field_of_exposure_is_recovered_and_each_photograph_gets_the_ro
 def test_what_only_one_photograph_shows_does_not_count() -> None:
     plain = estimate_gains(*make_views(0.25))
     occluded = estimate_gains(*make_views(0.25, occluder=True))
-    assert (plain - occluded).abs().max() < 0.06  # of 0.8 between the colours
+    assert (plain - occluded).abs().max() < 0.06  # the logarithms of the two colours differ by 0.8
 
 
 def test_without_surfaces_that_agree_nothing_changes() -> None:
