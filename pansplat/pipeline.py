@@ -496,8 +496,8 @@ def _refine_scene(
         refinement = Refinement(moved, views, config, seed=seed)
         report = refinement.run(**run)
         refined = refinement.scene()
-        if report.stopped == "veiled":
-            problem = f"{', '.join(scene.names)}: not refined, because that would cover surfaces between the cameras"
+        if report.stopped == "torn":
+            problem = f"{', '.join(scene.names)}: not refined, because pictures between the cameras would be torn"
             warnings.warn(problem, InputWarning, stacklevel=2)
         return replace(refined, gaussians=refined.gaussians.to(device=given)), report
 

@@ -302,6 +302,6 @@ def small_config() -> Any:
 
 
 @pytest.fixture
-def any_veil(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A refinement is kept whatever it covers: spheres around random images are not what a veil could hide."""
-    monkeypatch.setattr("pansplat.refinement.refinement._MAX_VEIL", 1.0)
+def any_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last state of a refinement is kept: random images say nothing about pictures between the cameras."""
+    monkeypatch.setattr("pansplat.refinement.refinement._ALLOWANCE", 1e9)

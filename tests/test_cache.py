@@ -119,7 +119,7 @@ def gray_pair(pair_folder: Path) -> Path:
     return pair_folder
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_refined_scene_is_cached_apart_from_its_prediction(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,7 +134,7 @@ def test_a_refined_scene_is_cached_apart_from_its_prediction(
     assert len(list((gray_pair / ".pansplat").iterdir())) == 2
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_refinement_is_the_same_however_busy_the_machine_is(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,7 +181,7 @@ def test_one_content_has_one_entry_whatever_names_and_paths_are(pair_folder: Pat
     assert scenes[3].names == ("客厅", "right") and scenes[3].model == other.name
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_cached_scene_is_opened_without_its_photographs(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:

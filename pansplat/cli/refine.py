@@ -122,9 +122,11 @@ def _describe(report: RefineReport, compared: str) -> str:
         "interrupted": ", interrupted",
         "time limit": ", ended by --seconds",
         "single view": "; a single view is not refined",
-        "veiled": "; the given scene is kept, because the refined one covers its surfaces between the cameras",
+        "torn": "; the given scene is kept, because pictures between the cameras would be torn",
         "worse": "; the given scene is kept, because the refined one is not better",
     }[report.stopped]
+    if 0 < report.kept < report.steps:
+        ending += f"; kept is the state after {report.kept}, whose pictures between the cameras are better"
     errors = f"{report.before:.4f} before, {report.after:.4f} after"
     return f"{report.steps} steps in {report.seconds:.1f} s{ending}; error of {compared} pixels {errors}"
 

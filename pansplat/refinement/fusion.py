@@ -18,14 +18,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import pad_equirect, row_weights, uv_from_directions
+from pansplat.geometry.equirect import pad_equirect, uv_from_directions
 from pansplat.rendering import rasterize
 
 _HEIGHT = 512  # rows of the depth of a view's surface
-_COVER_HEIGHT = 64  # rows of the images of `measure_cover`
-_FRONT = 0.85  # largest ratio of the distances of a Gaussian and of the surface that it is in front of
 _TOLERANCE = 0.1  # of a distance from the surface, relative to its depth
 BACKGROUND_LEVEL = 2  # the finest level of the background
 OPAQUE = 0.5  # least alpha of a surface
@@ -80,14 +77,3 @@ def are_seen(
     uv = uv_from_directions(offsets)
     row = (uv[:, 1] * height).long().clamp(0, height - 1)
     return offsets.norm(dim=1) <= (1 + _TOLERANCE) * reach[row, (uv[:, 0] * width).long() % width]
-
-
-def measure_cover(gaussians: Gaussians, surface: Gaussians, pose: Float[Tensor, "4 4"]) -> float:
-    """Share of the sphere around a camera that Gaussians cover in front of the surface of others."""
-    size = (_COVER_HEIGHT, 2 * _COVER_HEIGHT)
-    depth = rasterize(surface, pose, size=size).depth[None]
-    nearest = -functional.max_pool2d(-pad_equirect(depth, 1), 3, stride=1)[0]
-    is_front = are_seen(gaussians.means, pose, _FRONT / (1 + _TOLERANCE) * nearest)
-    harmonics = ((is_front.float() - 0.5) / SH_0)[:, None, None]
-    cover = rasterize(dataclasses.replace(gaussians, harmonics=harmonics), pose, size=size).color[0]
-    return float((cover.mean(1) * row_weights(size[0]).to(cover)).sum() / row_weights(size[0]).sum())

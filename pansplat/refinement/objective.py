@@ -6,6 +6,8 @@ weighted by solid angle. Blocks of pixels are held out of the loss; their error 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
+from pansplat.rendering import Rendering
 
 _BLOCKS = 32  # rows of held-out blocks
 
@@ -82,3 +85,31 @@ def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeigh
     below = error[:, 1:] - error[:, :-1]
     gradients = (right.abs().mean(0) * weights.right).sum() + (below.abs().mean(0) * weights.below[:-1]).sum()
     return colors + 0.5 * gradients
+
+
+def compare_places(
+    drawn: Rendering, pose: Float[Tensor, "4 4"], photographs: Sequence[tuple[Photograph, Float[Tensor, "4 4"]]]
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """How much the colours of a panorama differ from those that photographs show at its surfaces.
+
+    Args:
+        drawn: the panorama.
+        pose: of its camera.
+        photographs: each with its pose.
+
+    Returns:
+        The least mean absolute difference from a photograph, and the solid angle of each pixel, which is 0 without a
+        surface, and where all photographs are masked.
+    """
+    height, width = drawn.depth.shape
+    rays = pixel_directions(height, width, dtype=torch.float64, device=drawn.depth.device)
+    points = (rays * drawn.depth[..., None]) @ pose[:3, :3].T.to(rays) + pose[:3, 3].to(rays)
+    least = torch.full_like(drawn.depth, math.inf)
+    for photograph, camera in photographs:
+        uv = uv_from_directions((points - camera[:3, 3].to(rays)) @ camera[:3, :3].to(rays))
+        maps = torch.cat((photograph.image, (photograph.unmasked.pixels > 0)[None].to(photograph.image)))
+        *color, unmasked = sample_equirect(functional.interpolate(maps[None], (height, width), mode="area")[0], uv)
+        difference = (drawn.color - torch.stack(color)).abs().mean(0)
+        least = torch.minimum(least, torch.where(unmasked > 0.999, difference, math.inf))
+    is_compared = (drawn.alpha > 0.5) & least.isfinite()
+    return torch.where(is_compared, least, 0), row_weights(height).to(least)[:, None] * is_compared

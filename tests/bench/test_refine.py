@@ -46,7 +46,7 @@ def folder(tmp_path: Path, write_pair, sphere_predictor, monkeypatch: pytest.Mon
     return tmp_path / "rooms"
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_the_bench_writes_rows_means_table_and_plot(folder: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     paths = [str(folder / name) for name in ("one", "two")]

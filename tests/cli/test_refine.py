@@ -19,7 +19,7 @@ def refine(path: Path, out: Path, *arguments: object) -> int:
     return run(["refine", str(path), "-o", str(out), "--steps", "12", *map(str, arguments)])
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_pair_is_predicted_and_refined(room: Path, scene: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "refined.ply"
     assert refine(room, out, "--model", "sphere", "--height", HEIGHT) == 0
@@ -54,7 +54,7 @@ def test_layers_keep_all_gaussians(room: Path, tmp_path: Path, capsys) -> None:
     assert not layers.joint and len(layers.gaussians) > 900
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_scene_is_refined_with_the_photographs_of_its_pair(room: Path, scene: Path, tmp_path: Path) -> None:
     assert refine(room, tmp_path / "pair.ply", "--model", "sphere", "--height", HEIGHT) == 0
     assert refine(scene, tmp_path / "scene.ply", "--photographs", room) == 0
@@ -82,7 +82,7 @@ def test_a_single_view_is_written_as_it_is(room: Path, tmp_path: Path, capsys, m
     assert len(pipeline.load(tmp_path / "few.ply").gaussians) <= 100
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_ctrl_c_ends_the_refinement_and_writes_the_scene(room: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     from pansplat.refinement import Refinement
 

@@ -158,7 +158,7 @@ def test_lpips_is_optional(folder: Path, tmp_path: Path, sphere_predictor: type)
     assert "LPIPS" in [str(column.header) for column in results_table([case]).columns]
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(
     tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:

@@ -16,7 +16,6 @@ from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, fuse_views, refinement_fingerprint
 from pansplat.refinement import refinement as module
 from pansplat.refinement.budget import merge_to
-from pansplat.refinement.fusion import measure_cover
 from pansplat.refinement.parameters import LEARNING_RATES
 from pansplat.rendering import rasterize
 from pansplat.system.progress import show_progress
@@ -145,17 +144,43 @@ def test_what_parallax_shows_keeps_its_shape_and_nothing_becomes_much_more_opaqu
     assert changes[1] < 0.003 < changes[0] < 0.11
 
 
-def test_a_scene_that_covers_what_is_between_the_cameras_is_left_out_and_that_is_said(room, monkeypatch) -> None:
-    joint, middle = fuse_views(room.predicted), room.truth.pose_between(0.5)
+def test_what_is_in_neither_photograph_is_an_error_of_pictures_between_them(room, monkeypatch) -> None:
+    joint, middle = fuse_views(room.truth), room.truth.pose_between(0.5)
     ball = make_balls(middle[:3, 3].float() + torch.tensor([[0.0, 0.0, 0.5]]), 0.1)
-    veiled = Gaussians.cat([joint.gaussians, ball])
-    assert measure_cover(joint.gaussians, joint.gaussians, middle) < 0.005
-    assert 0.01 < measure_cover(veiled, joint.gaussians, middle) < 0.1
-    monkeypatch.setattr(Refinement, "_build", lambda self, layer: veiled)
-    assert Refinement(joint, room.views).measure_veil() > module._MAX_VEIL
-    monkeypatch.undo()
-    monkeypatch.setattr(module, "_MAX_VEIL", -1.0)
-    with pytest.warns(InputWarning, match="left, right: not refined, because that would cover surfaces"):
+    refinement = Refinement(joint, room.views)
+    given = refinement.half_way_error()
+    monkeypatch.setattr(Refinement, "_build", lambda self, layer: Gaussians.cat([joint.gaussians, ball]))
+    assert refinement.half_way_error() > module._ALLOWANCE * given
+    masks = torch.zeros_like(room.views.masks)
+    assert Refinement(joint, dataclasses.replace(room.views, masks=masks)).half_way_error() == 0
+
+
+@pytest.mark.parametrize(
+    ("errors", "kept"),
+    [((5, 4, 4.1, 3, 3.1), 8), ((5, 4, 3, 3.2, 3.3), 4), ((5, 4, 4.3, 3, 3.2), 6), ((5, 6, 5.3, 7, 6), 0)],
+)
+def test_the_last_state_is_kept_whose_pictures_between_the_cameras_are_as_good_as_the_best(
+    room, monkeypatch, errors: tuple[float, ...], kept: int
+) -> None:
+    monkeypatch.setattr(module, "drop_unseen", lambda scene, *_: scene)
+    monkeypatch.setattr(Refinement, "_finish", lambda self, scene: scene)
+    states, remaining = [room.predicted], iter(errors)
+
+    def judge(refinement: Refinement) -> float:
+        states.append(refinement.scene())
+        return next(remaining)
+
+    monkeypatch.setattr(Refinement, "half_way_error", judge)
+    refinement = Refinement(room.predicted, room.views)
+    report = refinement.run(steps=8)
+    assert (report.steps, report.kept, report.stopped) == (8, kept, "done" if kept else "torn")
+    expected = states[1 + kept // 2] if kept else room.predicted
+    assert all(torch.equal(a, b) for a, b in zip(_tensors(refinement.scene()), _tensors(expected), strict=True))
+
+
+def test_a_scene_whose_pictures_would_be_torn_is_left_as_it_is_and_that_is_said(room, monkeypatch) -> None:
+    monkeypatch.setattr(module, "_ALLOWANCE", 0.0)
+    with pytest.warns(InputWarning, match="left, right: not refined"):
         kept = pansplat.refine(room.predicted, room.views, steps=4)
     assert all(torch.equal(a, b) for a, b in zip(_tensors(kept), _tensors(room.predicted), strict=True))
 
@@ -212,7 +237,7 @@ def test_a_limited_scene_is_compared_at_the_rows_of_a_display(room, monkeypatch:
     assert errors[1] < 0.8 * errors[0]
 
 
-@pytest.mark.usefixtures("any_veil")
+@pytest.mark.usefixtures("any_state")
 def test_a_coarse_scene_is_split_within_its_limit_and_explains_the_photographs_better(room) -> None:
     coarse = merge_to(room.predicted, room.views.images.shape[-2:], 160)
     plain, _ = _refine(room, steps=60, scene=coarse, splits=())
