@@ -39,7 +39,6 @@ from pansplat.inputs.placements import (
     is_by_hand,
     judge,
     read_approximate,
-    read_rejected,
     read_ties,
     read_unit,
 )
@@ -57,7 +56,6 @@ from pansplat.system.files import read_file
 from pansplat.system.strict_json import read_field, read_json
 
 POSES, PAIRS = "poses.json", "pairs.json"
-_REJECTED = "rejected by hand"
 _MAX_WORLD = 9999  # of poses.json
 MATRIX_KEYS = ("cam2world", "world2cam", "pose")
 _IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # of a sequence
@@ -145,11 +143,8 @@ def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], sourc
     for world in {panorama.world for panorama in panoramas}:
         names = [name for name, view in zip(entries, panoramas, strict=True) if view.world == world]
         placements |= judge(names, ties, by_hand, source)
-    rejected = {name for poses in read_rejected(content) for name in poses}
     return [
-        dataclasses.replace(
-            panorama, placement=dataclasses.replace(placements[name], is_rejected=name in rejected - by_hand)
-        )
+        dataclasses.replace(panorama, placement=placements[name])
         for name, panorama in zip(entries, panoramas, strict=True)
     ]
 
@@ -158,8 +153,7 @@ def _read_reasons(content: dict[str, Any]) -> dict[str, str]:
     """Why panoramas have no pose, by the names of their files, as poses.json states it."""
     estimate = content.get("estimate")
     reasons = estimate.get("unplaced") if isinstance(estimate, dict) else None
-    rejected = [name for poses in read_rejected(content) for name in poses]
-    return (reasons if isinstance(reasons, dict) else {}) | dict.fromkeys(rejected, _REJECTED)
+    return reasons if isinstance(reasons, dict) else {}
 
 
 def _explain_unposed(
@@ -167,7 +161,7 @@ def _explain_unposed(
 ) -> Panorama:
     """A panorama beside those of poses.json, with the reason that it states."""
     reason = str(reasons.get(panorama.image.name, f"{POSES} has no pose of it"))
-    placement = Placement("not placed", reason, source, is_rejected=reason == _REJECTED, about=about)
+    placement = Placement("not placed", reason, source, about=about)
     return dataclasses.replace(panorama, placement=placement)
 
 

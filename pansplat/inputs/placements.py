@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 from msgspec import Struct
 
 from pansplat.errors import InputError
+from pansplat.system.components import label_components
 from pansplat.system.strict_json import convert
 
 State = Literal["placed", "probable", "by hand", "not placed"]
@@ -50,14 +51,12 @@ class Placement:
         state: `probable` if it depends on pairs that may be wrong.
         reason: why there is no pose, or by which pairs it is probable.
         source: the poses.json or the cached estimate that states it; None for other formats.
-        is_rejected: whether a user has rejected its pose.
         about: where one that is not placed may be.
     """
 
     state: State = "placed"
     reason: str = ""
     source: Path | None = None
-    is_rejected: bool = False
     about: ApproximatePlace | None = None
 
 
@@ -74,24 +73,6 @@ class Tie(NamedTuple):
     first: str
     second: str
     is_certain: bool
-
-
-@dataclass(frozen=True)
-class Hold:
-    """What holds a panorama in its group, if that is only probable.
-
-    Attributes:
-        ties: the probable pairs between its part and the core.
-        members: the panoramas that leave the group without them, in the group's order.
-    """
-
-    ties: tuple[Tie, ...]
-    members: tuple[str, ...]
-
-    @property
-    def reason(self) -> str:
-        """The ties, for people."""
-        return "by probable pairs only: " + ", ".join(f"{tie.first} - {tie.second}" for tie in self.ties)
 
 
 def read_ties(estimate: Any) -> list[Tie]:
@@ -148,78 +129,45 @@ def is_by_hand(entry: Any) -> bool:
     return isinstance(entry, dict) and entry.get("placed") == BY_HAND
 
 
-def read_rejected(content: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The entries by name of each rejection that poses.json records; invalid ones are ignored."""
-    records = content.get("rejected")
-    records = records if isinstance(records, list) else []
-    found = [record.get("poses") for record in records if isinstance(record, Mapping)]
-    return [poses for poses in found if isinstance(poses, dict)]
-
-
-def find_holds(names: Sequence[str], ties: Iterable[Tie], fixed: Collection[str] = ()) -> dict[str, Hold]:
-    """What holds each panorama of a group that is only probably placed.
+def find_probable(names: Sequence[str], ties: Iterable[Tie], fixed: Collection[str] = ()) -> dict[str, str]:
+    """The panoramas of a group that are only probably placed, and by which pairs.
 
     Args:
         names: of the group.
         ties: of it; those with other panoramas are ignored. A panorama without any is placed otherwise.
         fixed: panoramas that are placed by hand.
     """
-    inside = set(names) - set(fixed)
-    own = [tie for tie in ties if tie.first in inside and tie.second in inside]
-    part = {name: number for number, name in enumerate(names)}
-    for tie in own:
-        if tie.is_certain:
-            joined = part[tie.first], part[tie.second]
-            part = {name: min(joined) if number in joined else number for name, number in part.items()}
-    tied = [name for name in names if any(name in tie[:2] for tie in own)]
-    if not tied:
-        return {}
-    numbers = [part[name] for name in tied]
-    core = max(numbers, key=lambda number: (numbers.count(number), -number))
-    links = [tie for tie in own if part[tie.first] != part[tie.second]]
-    depth = _measure_depths(core, {(part[tie.first], part[tie.second]) for tie in links})
-    holds = {}
-    for number in sorted(set(numbers) & set(depth) - {core}):
-        holding = tuple(tie for tie in links if _is_towards_core(tie, number, part, depth))
-        reached = _measure_depths(core, {(part[tie.first], part[tie.second]) for tie in links if tie not in holding})
-        members = tuple(name for name in tied if part[name] in depth and part[name] not in reached)
-        holds |= {name: Hold(holding, members) for name in tied if part[name] == number}
-    is_single = numbers.count(core) == 1
-    if is_single and holds:  # no pair of the group is certain
-        name = next(name for name in tied if part[name] == core)
-        holding = tuple(tie for tie in links if name in tie[:2])
-        holds[name] = Hold(holding, (name,))
-    return holds
-
-
-def _is_towards_core(tie: Tie, number: int, part: Mapping[str, int], depth: Mapping[int, int]) -> bool:
-    ends = part[tie.first], part[tie.second]
-    return number in ends and depth[sum(ends) - number] <= depth[number]
-
-
-def _measure_depths(start: int, edges: Collection[tuple[int, int]]) -> dict[int, int]:
-    """The number of edges from a part to those that edges connect with it."""
-    depth, last = {start: 0}, [start]
-    while last:
-        beside = {b for a, b in edges if a in last} | {a for a, b in edges if b in last}
-        last = sorted(beside - set(depth))
-        depth |= dict.fromkeys(last, max(depth.values()) + 1)
-    return depth
+    number = {name: n for n, name in enumerate(names) if name not in fixed}
+    own = [tie for tie in ties if tie.first in number and tie.second in number]
+    edges = [(number[tie.first], number[tie.second]) for tie in own]
+    group = label_components(len(names), edges)
+    part = label_components(len(names), [edge for edge, tie in zip(edges, own, strict=True) if tie.is_certain])
+    tied = [n for n in number.values() if any(n in edge for edge in edges)]
+    parts, found = [part[n] for n in tied], {}
+    core = max(dict.fromkeys(parts), key=parts.count, default=0)
+    for n in tied:
+        is_outside = part[n] != core or parts.count(core) == 1  # in the second case no pair of the group is certain
+        if is_outside and group[n] == group[tied[parts.index(core)]]:
+            own_ties = [
+                tie for (a, b), tie in zip(edges, own, strict=True) if (part[a] == part[n]) != (part[b] == part[n])
+            ]
+            found[names[n]] = "by probable pairs only: " + ", ".join(f"{tie.first} - {tie.second}" for tie in own_ties)
+    return found
 
 
 def judge(
     names: Sequence[str], ties: Iterable[Tie], by_hand: Collection[str], source: Path | None
 ) -> dict[str, Placement]:
-    """The placements of the panoramas of one group; see `find_holds`."""
+    """The placements of the panoramas of one group; see `find_probable`."""
     if len(names) == 1:
         return {names[0]: Placement("not placed", "no other panorama has a pose with it", source)}
-    holds = find_holds(names, ties, by_hand)
+    probable = find_probable(names, ties, by_hand)
     placements = {}
     for name in names:
         if name in by_hand:
             placements[name] = Placement("by hand", source=source)
-        elif name in holds:
-            placements[name] = Placement("probable", holds[name].reason, source)
+        elif name in probable:
+            placements[name] = Placement("probable", probable[name], source)
         else:
             placements[name] = Placement(source=source)
     return placements

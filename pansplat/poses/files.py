@@ -26,7 +26,6 @@ from pansplat.poses.pose_file import (
     CONVENTION,
     list_approximate,
     list_pairs,
-    list_suggestions,
     make_pose_content,
     make_world,
 )
@@ -154,11 +153,10 @@ def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float)
         estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height)
     except NoPosesError as error:
         worlds, summary, unplaced, pairs = [], "", error.reasons, []
-        suggestions, approximate = error.suggestions, error.approximate
+        approximate = error.approximate
     else:
         worlds = [make_world(group, names) for group in estimate.groups]
-        summary, unplaced, suggestions = estimate.summary, estimate.unplaced, estimate.suggestions
-        approximate = estimate.approximate
+        summary, unplaced, approximate = estimate.summary, estimate.unplaced, estimate.approximate
         pairs = list_pairs(estimate, names)
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
@@ -169,7 +167,6 @@ def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float)
         "unplaced": {names[image]: reason for image, reason in unplaced.items()},
         "unreadable": [names[image] for image in unreadable],
         "pairs": pairs,
-        "suggestions": list_suggestions(suggestions, names),
         "approximate": list_approximate(approximate, names),
     }
 
@@ -211,7 +208,7 @@ def _make_pairs(
         for name, placement in placements.items():
             if placement.state == "probable":
                 view = by_name[name]
-                outcome = "is only probably placed, and can be rejected in pansplat-view"
+                outcome = "is only probably placed; if it is wrong, place it in pansplat-view"
                 message = f"{_describe(view, folder)} {outcome}: {placement.reason}"
                 warnings.warn(message, InputWarning, stacklevel=4)
         placed = tuple(

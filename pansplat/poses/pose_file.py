@@ -14,13 +14,13 @@ import numpy as np
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.placements import is_by_hand
 from pansplat.poses.approximate import LinkedPlace
-from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
+from pansplat.poses.estimate import PoseEstimate, PoseGroup
 
 CONVENTION = "cam2world opencv"
 
 
 def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
-    """The content of a poses.json: the poses of all groups (a world each), their pairs, and suggestions."""
+    """The content of a poses.json: the poses of all groups (a world each), their pairs, and approximate places."""
     worlds = [make_world(group, names) for group in estimate.groups]
     return make_pose_file(
         worlds,
@@ -28,7 +28,6 @@ def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
             "pairs": list_pairs(estimate, names),
-            "suggestions": list_suggestions(estimate.suggestions, names),
             "approximate": list_approximate(estimate.approximate, names),
         },
     )
@@ -72,17 +71,6 @@ def list_pairs(estimate: PoseEstimate, names: Mapping[Path, str]) -> list[dict[s
     return [
         {"between": [tie.first, tie.second], "check": "certain" if tie.is_certain else "probable"}
         for tie in estimate.list_ties(names)
-    ]
-
-
-def list_suggestions(suggestions: Suggestions, names: Mapping[Path, str]) -> list[dict[str, Any]]:
-    """Places of the second panorama of a pair relative to the first: right, forward (camera heights), yaw, log-odds."""
-    return [
-        {
-            "between": [names[first], names[second]],
-            "places": [[round(x, 4) for x in (*s.place, s.log_odds)] for s in own],
-        }
-        for (first, second), own in suggestions.items()
     ]
 
 
