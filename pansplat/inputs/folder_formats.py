@@ -37,9 +37,7 @@ from pansplat.inputs.placements import (
     ApproximatePlace,
     Placement,
     is_by_hand,
-    judge,
     read_approximate,
-    read_ties,
     read_unit,
 )
 from pansplat.inputs.poses import (
@@ -137,15 +135,15 @@ def _read_tour_of_folder(folder: Path) -> dict[str, Panorama]:
 
 def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
     """The panoramas of poses.json with their placements."""
-    entries = content["poses"]
-    by_hand = {name for name, entry in entries.items() if is_by_hand(entry)}
-    ties, placements = read_ties(content.get("estimate")), {}
-    for world in {panorama.world for panorama in panoramas}:
-        names = [name for name, view in zip(entries, panoramas, strict=True) if view.world == world]
-        placements |= judge(names, ties, by_hand, source)
+    sizes, alone = Counter(view.world for view in panoramas), "no other panorama has a pose with it"
     return [
-        dataclasses.replace(panorama, placement=placements[name])
-        for name, panorama in zip(entries, panoramas, strict=True)
+        dataclasses.replace(
+            view,
+            placement=Placement("not placed", alone, source)
+            if sizes[view.world] == 1
+            else Placement("by hand" if is_by_hand(entry) else "placed", source=source),
+        )
+        for entry, view in zip(content["poses"].values(), panoramas, strict=True)
     ]
 
 

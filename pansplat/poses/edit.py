@@ -25,7 +25,7 @@ from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
-from pansplat.inputs.placements import BY_HAND, read_ties, read_unit
+from pansplat.inputs.placements import BY_HAND, list_approximate, read_unit
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.web_tours import is_scene_of_tour
@@ -207,14 +207,11 @@ def merge_estimate(
             poses[name] = entry | {"world": _find_free_world(content)}
     fresh, old = make_pose_content(estimate, names)["estimate"], _read_estimate(content)
     read, files = set(names.values()), {image.name for image in names}
-    pairs = [pair for pair in _list_pairs(old) if set(pair["between"]) <= kept]
-    pairs += [pair for pair in fresh["pairs"] if not set(pair["between"]) <= kept]
     unplaced = old["unplaced"].items() if isinstance(old.get("unplaced"), dict) else ()
     content["estimate"] = {
         **old,
         **fresh,
-        "pairs": pairs,
-        "approximate": [pair for pair in _list_pairs(old, "approximate") if not set(pair["between"]) <= read]
+        "approximate": [entry for entry, stated in list_approximate(old) if not set(stated.between) <= read]
         + fresh["approximate"],
         "unplaced": {name: reason for name, reason in unplaced if name not in files} | fresh["unplaced"],
         "written": " ".join(mark for world, mark in mark_worlds(content).items() if world in own),
@@ -282,12 +279,11 @@ def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, P
     worlds = [
         world | {"poses": {rename(name): pose for name, pose in world["poses"].items()}} for world in cached["worlds"]
     ]
-    renamed = {
-        key: [pair | {k: [*map(rename, pair[k])] for k in ("between", "by") if k in pair} for pair in cached[key]]
-        for key in ("pairs", "approximate")
-    }
+    approximate = [
+        about | {key: [*map(rename, about[key])] for key in ("between", "by")} for about in cached["approximate"]
+    ]
     unplaced = {by_name[name].name if name in by_name else name: reason for name, reason in cached["unplaced"].items()}
-    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, **renamed})
+    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, "approximate": approximate})
 
 
 def _find_free_world(content: Content, former: Sequence[Any] = ()) -> int:
@@ -341,12 +337,6 @@ def _put(
     if world or "world" in entry:
         entry["world"] = world
     content["poses"][name] = entry[key] if set(entry) == {convention.split()[0]} else entry
-
-
-def _list_pairs(estimate: Content, key: str = "pairs") -> list[Content]:
-    """The valid pairs of an estimate, or its "approximate", as the file has them."""
-    pairs = estimate.get(key)
-    return [pair for pair in pairs if read_ties({"pairs": [pair]})] if isinstance(pairs, list) else []
 
 
 def _read(file: Path) -> bytes | None:

@@ -19,7 +19,6 @@ from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
-from pansplat.inputs.placements import Tie, find_probable
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.approximate import LinkedPlace, place_linked
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes
@@ -123,7 +122,6 @@ class PoseEstimate:
         groups: of panoramas that reliable pairs connect, the largest one first; each has a world of its own.
         unplaced: the reason for each file without a pose.
         relations: of the pairs that were compared, by indices into `images`.
-        rejected: pairs of them that contradict the others and are not used.
         names: of the files, for messages; by default their own.
         approximate: about where files without a pose are, by links.
     """
@@ -132,7 +130,6 @@ class PoseEstimate:
     groups: tuple[PoseGroup, ...]
     unplaced: dict[Path, str]
     relations: dict[IndexPair, RelativePose]
-    rejected: tuple[IndexPair, ...] = ()
     names: Mapping[Path, str] = field(default_factory=dict)
     approximate: Mapping[Path, LinkedPlace] = field(default_factory=dict)
 
@@ -156,26 +153,6 @@ class PoseEstimate:
             for image in group.poses:
                 others = ", ".join(self.name_of(other) for other in group.poses if other != image)
                 found[image] = f"it has a pose with {others} only"
-        return found
-
-    def list_ties(self, names: Mapping[Path, str]) -> list[Tie]:
-        """The pairs that hold the groups together, by the names of their files."""
-        ties = []
-        for (i, j), relation in self.relations.items():
-            ends = self.images[i], self.images[j]
-            is_used = relation.is_reliable and (i, j) not in self.rejected
-            if is_used and any(all(end in group.poses for end in ends) for group in self.groups):
-                ties.append(Tie(names[ends[0]], names[ends[1]], relation.is_certain))
-        return ties
-
-    @property
-    def probable(self) -> dict[Path, str]:
-        """For each file that only probable pairs connect with the core of its group, these pairs."""
-        names = {image: self.name_of(image) for image in self.images}
-        ties, found = self.list_ties(names), {}
-        for group in self.groups:
-            probable = find_probable([names[image] for image in group.poses], ties)
-            found |= {image: probable[names[image]] for image in group.poses if names[image] in probable}
         return found
 
     @property
@@ -337,7 +314,6 @@ def estimate_poses(
         tuple(groups),
         {paths[n]: unplaced[n] for n in sorted(unplaced)},
         {(kept[i], kept[j]): relation for (i, j), relation in (relations | tour.confirmed).items()},
-        tuple((kept[i], kept[j]) for i, j in tour.rejected),
         names,
         _place_linked(views, files, links, groups),
     )

@@ -20,14 +20,13 @@ CONVENTION = "cam2world opencv"
 
 
 def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
-    """The content of a poses.json: the poses of all groups (a world each), their pairs, and approximate places."""
+    """The content of a poses.json: the poses of all groups (a world each), and approximate places."""
     worlds = [make_world(group, names) for group in estimate.groups]
     return make_pose_file(
         worlds,
         {
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
-            "pairs": list_pairs(estimate, names),
             "approximate": list_approximate(estimate.approximate, names),
         },
     )
@@ -64,14 +63,6 @@ def mark_worlds(content: Mapping[str, Any]) -> dict[int, str]:
     return {
         world: hashlib.blake2b(json.dumps(state).encode(), digest_size=8).hexdigest() for world, state in states.items()
     }
-
-
-def list_pairs(estimate: PoseEstimate, names: Mapping[Path, str]) -> list[dict[str, Any]]:
-    """The pairs that hold the groups together, and how certain they are."""
-    return [
-        {"between": [tie.first, tie.second], "check": "certain" if tie.is_certain else "probable"}
-        for tie in estimate.list_ties(names)
-    ]
 
 
 def list_approximate(places: Mapping[Path, LinkedPlace], names: Mapping[Path, str]) -> list[dict[str, Any]]:

@@ -18,30 +18,22 @@ from pansplat.poses.edit import PoseEditor
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.files import write_poses
 from pansplat.poses.placing import PlanPose
-from pansplat.poses.two_view import RelativePose
 
 NAMES = "abcdef"
 
 
-def _relation(log_odds: float) -> RelativePose:
-    none = np.zeros((0, 2), np.int64)
-    figures = {"score": 100, "margin": 100, "places": 40, "uncertainty": (0.01, 0.01), "distance": 1.0}
-    return RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, log_odds=log_odds, **figures)
-
-
 def _estimate(images, **options) -> PoseEstimate:
-    """a, b, c (certain), d probable by c, e probable by d; f is not placed. Cameras are 1 m apart along x."""
+    """Poses of a to e, 1 m apart along x; f is not placed."""
     images = list(images)
     poses = {}
     for step, image in enumerate(images[:5]):
         poses[image] = np.eye(4)
         poses[image][0, 3] = step
-    odds = {(0, 1): np.inf, (1, 2): 3.0, (2, 3): 0.5, (3, 4): 0.5}
     return PoseEstimate(
         tuple(images),
         (PoseGroup(poses, 0.4, 8.0, 0.0, "a test", 1.6),),
         {images[5]: "no door"} if len(images) > 5 else {},
-        {pair: _relation(value) for pair, value in odds.items() if max(pair) < len(images)},
+        {},
         approximate={images[5]: LinkedPlace(images[0], PlanPose(1.0, 2.0, 0.5), (images[1],))}
         if len(images) > 5
         else {},
@@ -76,29 +68,18 @@ def _content(folder: Path) -> dict:
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
-ALL = {"a": "placed", "b": "placed", "c": "placed", "d": "probable", "e": "probable", "f": "not placed"}
+ALL = {"a": "placed", "b": "placed", "c": "placed", "d": "placed", "e": "placed", "f": "not placed"}
 
 
 def test_states_and_reasons_are_those_of_the_estimate_also_from_its_cache_and_from_a_file(folder: Path, monkeypatch):
     for _ in range(2):
         views = _load(folder)
         assert _states(folder) == ALL
-        assert views["d"].placement.reason == "by probable pairs only: c - d, d - e"
         assert views["f"].placement.reason == "no door"
         monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)
     write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
     assert _states(folder) == ALL
     assert _load(folder)["f"].placement.reason == "no door"
-
-
-def test_a_note_names_what_is_only_probable(folder: Path):
-    with pytest.warns(UserWarning, match=r"d\.png is only probably placed.*by probable pairs only: c - d, d - e"):
-        pansplat.load_pairs(folder)
-    estimate = _estimate(sorted(folder.glob("*.png")))
-    assert {image.name: reason for image, reason in estimate.probable.items()} == {
-        "d.png": "by probable pairs only: c.png - d.png, d.png - e.png",
-        "e.png": "by probable pairs only: d.png - e.png",
-    }
 
 
 def test_rejections_and_suggestions_of_earlier_versions_are_ignored_and_kept(folder: Path):
@@ -259,6 +240,7 @@ def test_all_groups_of_an_estimate_are_written(folder: Path):
     poses = [{image: np.eye(4) for image in part} for part in (images[:2], images[2:4])]
     groups = tuple(PoseGroup(own, 0.3 + n, 8.0 + n, 0.0, "a test") for n, own in enumerate(poses))
     write_poses(PoseEstimate(tuple(images), groups, {}, {}), folder / "poses.json")
+    assert _states(folder) == dict.fromkeys("abcd", "placed") | dict.fromkeys("ef", "not placed")
     pairs = pansplat.load_pairs(folder)
     assert [[view.world for view in pair.context] for pair in pairs[:2]] == [[0, 0], [1, 1]]
     assert [(pair.near, pair.far) for pair in pairs[:2]] == [(0.3, 8), (1.3, 9)]
@@ -424,7 +406,6 @@ def test_poses_of_panoramas_that_are_not_read_stay_and_hold_the_others(folder: P
     views = _load(folder)
     assert [views[name].cam2world[0, 3].item() for name in "abcdef"] == [0, 1, 2, 3, 4, 5]
     assert len({view.world for view in views.values()}) == 1
-    assert _content(folder)["estimate"]["pairs"][0]["between"] == ["a.png", "b.png"]
 
 
 def test_a_panorama_that_was_removed_does_not_hold_the_others(folder: Path):

@@ -25,7 +25,6 @@ Color = tuple[float, float, float, float]
 
 STATES: dict[str, Color] = {
     "sure": (0.45, 0.8, 0.5, 1.0),
-    "probable": (0.75, 0.8, 0.4, 1.0),
     "about here": (1.0, 0.8, 0.3, 1.0),
     "nowhere": (0.95, 0.45, 0.4, 1.0),
 }
@@ -42,9 +41,9 @@ _FLAGS = imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_scroll_wi
 
 def describe_state(placement: Placement) -> str:
     """How sure a place is; one of `STATES`."""
-    if placement.state == "not placed":
-        return "nowhere" if placement.about is None else "about here"
-    return "probable" if placement.state == "probable" else "sure"
+    if placement.state != "not placed":
+        return "sure"
+    return "nowhere" if placement.about is None else "about here"
 
 
 def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None:
