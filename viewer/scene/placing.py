@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pansplat_viewer.window.input import Input
 
 WALL_ANGLE = math.radians(6)  # within which walls become parallel
-_APART = 0.5  # metres, between the others and a panorama of which no place is known
+_APART = 0.3  # metres, between a door or the others and a panorama of which no place is known
 _PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # metres, around what a plan shows, and of its sides
 
 Nodes = tuple[int, ...]
@@ -92,12 +92,12 @@ class Placing:
         return Placing(source.folder, panoramas) if source is not None and panoramas else None
 
     def reopen(self, entries: Sequence[SceneEntry]) -> bool:
-        """Take the poses of panoramas that were loaded again; returns False if they are others.
+        """Take the poses of panoramas that were loaded again; returns False if they are others, or had no poses before.
 
         Changes before can still be undone.
         """
         panoramas = tuple(list_panoramas(entries, self._folder))
-        if [view.image for view in panoramas] != [view.image for view in self.panoramas]:
+        if self._editor is None or [view.image for view in panoramas] != [view.image for view in self.panoramas]:
             return False
         self.panoramas, self._is_changed = panoramas, False
         if self.node is not None and self.targets not in self.list_targets(self.node):
@@ -151,7 +151,8 @@ class Placing:
         self.targets = targets or options[0]
         about = self.panoramas[node].placement.about
         beside = [other for other in self.targets if about is not None and self._image(other) == about.beside]
-        self._anchor = (beside or self.targets)[0]
+        linked = [other for other in self.targets if self._list_links(other, node)]
+        self._anchor = (*beside, *linked, *self.targets)[0]
         first = self.panoramas[self._anchor]
         self._world = first.world if self._is_placed(self._anchor) else None
         try:
@@ -238,7 +239,7 @@ class Placing:
     # --- the place ---
 
     def _choose_place(self) -> PlanPose:
-        """Where the panorama is at first: its pose if it has one here, its approximate place, or beside the others."""
+        """The first place: the pose if there is one here, the approximate place, behind a door, or beside all."""
         assert self.node is not None
         if self._is_inside:
             return self.floor.find_place(self._get_pose(self.node), self._upright(self.node))
@@ -246,12 +247,18 @@ class Placing:
         if about is not None and about.beside == self._image(self._anchor):
             unit = self.floor.unit if about.is_in_heights else 1.0
             return anchor.add(PlanPose(about.right, about.forward, about.yaw), unit)
+        if doors := self._find_doors(self._anchor, self.node):
+            edge, ahead = doors[0], doors[0] - anchor[:2]
+            ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+        else:  # to the right of all
+            outline, right = self.outline(self._anchor), max(self.find_place(target).right for target in self.targets)
+            right = right if outline is None else max(right, outline[:, 0].max())
+            edge, ahead = np.array((right, anchor.forward)), np.array((1.0, 0.0))
         yaw = self._align(0.0, math.inf)
         room = self._draw(self.node, PlanPose(0.0, 0.0, yaw))
-        others = [np.array([self.find_place(target)[:2] for target in self.targets]), self._draw(self._anchor, anchor)]
-        right = max(points[:, 0].max() for points in others if points is not None)
-        left = 0.0 if room is None else room[:, 0].min()
-        return PlanPose(float(right - left) + _APART, anchor.forward, yaw)
+        assert room is not None
+        right, forward = (edge + (_APART - (room @ ahead).min()) * ahead).tolist()
+        return PlanPose(right, forward, yaw)
 
     @property
     def _is_inside(self) -> bool:
@@ -327,17 +334,20 @@ class Placing:
         new = self.floor.make_pose(place, level, _measure_down(self.floor, self._get_pose(beside)))
         return {node: new @ np.linalg.inv(old) @ self._get_pose(node) for node in self.moved}
 
+    def _list_links(self, start: int, end: int) -> list[float]:
+        """The yaws of the links of a panorama to another one."""
+        return [link.yaw for link in self.panoramas[start].links if link.target == self.panoramas[end].name]
+
+    def _find_doors(self, start: int, end: int) -> list[Float[np.ndarray, "2"]]:
+        """Where the links of a panorama to another one meet its outline, which is by azimuth."""
+        outline, yaws = self.outline(start), self._list_links(start, end)
+        return [] if outline is None else [outline[int(yaw / math.tau % 1 * len(outline))] for yaw in yaws]
+
     def find_doors(self) -> list[Float[np.ndarray, "2"]]:
-        """Where links between the panorama and the others meet the outline that they start in."""
-        assert self.node is not None
-        found = []
-        for target in self.targets if self.place is not None else ():
-            for start, end in ((target, self.node), (self.node, target)):
-                outline = self.outline(start)
-                yaws = [link.yaw for link in self.panoramas[start].links if link.target == self.panoramas[end].name]
-                if outline is not None:  # by azimuth
-                    found += [outline[int(yaw / math.tau % 1 * len(outline))] for yaw in yaws]
-        return found
+        """The doors to which links between the panorama and the others lead, as both show them."""
+        assert self.node is not None and self.place is not None
+        pairs = [pair for target in self.targets for pair in ((target, self.node), (self.node, target))]
+        return [door for pair in pairs for door in self._find_doors(*pair)]
 
     # --- the file ---
 

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import wrap_angle
 from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.placements import Placement
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece, PlanPose
@@ -134,10 +136,22 @@ def test_a_panorama_starts_at_its_approximate_place(folder: Path, unit: float | 
     placing.close()
 
 
+def test_a_panorama_to_which_only_a_link_leads_starts_behind_the_door(folder: Path):
+    (folder / "links.json").write_text(json.dumps({"b": [{"to": "d", "yaw": -2.0}]}))
+    placing = Placing(folder, _load(folder), read=_read)
+    _place(placing, 3)
+    (door,), camera = placing.find_doors(), np.array(placing.find_place(1)[:2])
+    ahead = (door - camera) / np.linalg.norm(door - camera)
+    assert ((placing.outline(3) - door) @ ahead).min() == pytest.approx(0.3)
+    side = np.array((ahead[1], -ahead[0]))
+    assert (placing.place[:2] - door) @ side == pytest.approx(0, abs=1e-9) and placing.is_aligned
+    placing.close()
+
+
 def test_a_panorama_of_which_nothing_is_known_starts_beside_the_others_with_parallel_walls(placing: Placing):
     _place(placing, 3)
     assert placing.is_aligned
-    assert placing.outline(3)[:, 0].min() > placing.outline(0)[:, 0].max() + 0.4
+    assert placing.outline(3)[:, 0].min() > placing.outline(0)[:, 0].max() + 0.25
 
 
 def test_walls_snap_to_those_of_the_plan_when_they_are_nearly_parallel(started: Placing):
@@ -266,6 +280,16 @@ def test_poses_of_other_formats_are_listed_as_not_changeable(folder: Path):
     assert not placing.is_listed and "got another format" in placing.problem
     placing.start(0)
     assert placing.node is None and placing.error == placing.problem
+
+
+def test_panoramas_can_be_placed_when_their_poses_are_estimated(folder: Path):
+    """A window has them before, without poses."""
+    entries = _list(folder)
+    before = Placing(folder, [replace(view, placement=Placement("not placed")) for view in _load(folder)])
+    placing = Placing.open(before, entries[0], entries)
+    assert before.problem and placing.problem is None and placing.is_listed
+    assert Placing.open(placing, entries[-1], entries) is placing, "so that its changes can be undone"
+    assert Placing.open(placing, None, []) is None
 
 
 def test_a_view_of_a_plan_has_all_points_and_one_scale():
