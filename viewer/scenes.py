@@ -49,7 +49,6 @@ class Scenes:
         at: float,
         show_error: Callable[[str], None],
         listed: Callable[[Path | None], None],
-        entered: Callable[[SceneEntry], None],
     ) -> None:
         """Show nothing yet.
 
@@ -61,11 +60,10 @@ class Scenes:
             at: fraction of the flight at which a scene is entered.
             show_error: shows a message.
             listed: called when other entries are listed, with the path at which they were found.
-            entered: called when a scene is shown.
         """
         self._state, self._stage, self.loader, self._find = state, stage, loader, find
         self._at = at
-        self._show_error, self._listed, self._entered = show_error, listed, entered
+        self._show_error, self._listed = show_error, listed
         self.entries: list[SceneEntry] = []
         self.current = -1
         self.path: Path | None = None
@@ -85,7 +83,12 @@ class Scenes:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was not used or not placed at the path, and why."""
-        return self.entries[self.current].notes if 0 <= self.current < len(self.entries) else ()
+        return () if self.entry is None else self.entry.notes
+
+    @property
+    def entry(self) -> SceneEntry | None:
+        """The entry that is shown or loaded."""
+        return self.entries[self.current] if 0 <= self.current < len(self.entries) else None
 
     @property
     def loaded(self) -> LoadedScene | None:
@@ -299,7 +302,6 @@ class Scenes:
         self._kept = self.entries, self.current, self.path
         stage.clear()
         stage.photographs.open(entry.panoramas)
-        self._entered(entry)
         state.show_message(f"{entry.name}   (H shows the keys)")
         if entry.tour is None:
             enter_scene(state, loaded.scene, at=self._at)

@@ -58,7 +58,7 @@ class Viewer:
         state: the values that a user can change.
         scenes: those to choose from, which one is shown, and which one comes next.
         stage: draws the image.
-        placing: the photographs whose poses a user changes; None without any.
+        placing: the panoramas whose poses a user changes; None without any.
         hotspots: places of panoramas in the image.
         panels: the panels, with the rectangles of their widgets.
         recent: the paths that were opened, the last one first.
@@ -107,9 +107,9 @@ class Viewer:
             at=at,
             show_error=self.show_error,
             listed=self._note_listed,
-            entered=self._open_placing,
         )
         self.placing: Placing | None = None
+        self._placed: SceneEntry | None = None  # whose panoramas `placing` has
         self._folder = folder
         self.panels = Panels(ctx)
         self._recent_file, self.recent = recent, read_recent(recent)
@@ -130,7 +130,7 @@ class Viewer:
     @property
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
-        is_placing = self.placing is not None and self.placing.is_busy
+        is_placing = self.placing is not None and self.placing.progress is not None
         return self.moving or self.scenes.is_busy or self.stage.photographs.is_reading or is_placing
 
     @property
@@ -171,6 +171,9 @@ class Viewer:
         self.scenes.poll()
         if not self.moving:
             self.scenes.exchange()
+        if self.scenes.entry is not self._placed:
+            self._placed = self.scenes.entry
+            self.placing = Placing.open(self.placing, self._placed, self.scenes.entries)
         if self.placing is not None:
             self.placing.update()
             self.error, self.placing.error = self.placing.error or self.error, None
@@ -211,9 +214,6 @@ class Viewer:
         self.error = None
         if path is not None:
             self.recent = add_recent(self.recent, path, self._recent_file)
-
-    def _open_placing(self, entry: SceneEntry) -> None:
-        self.placing = Placing.open(self.placing, entry, self.scenes.entries)
 
     def dismiss_error(self) -> None:
         """Close the error message, and go on with the scene that is shown."""

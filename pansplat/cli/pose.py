@@ -77,8 +77,6 @@ def _print_estimate(estimate: PoseEstimate, *, figures: bool) -> None:
             )
     make_table_console().print(table)
     print(estimate.summary)
-    for image, reason in estimate.probable.items():
-        print_message("note", f"{estimate.name_of(image)} is only probably placed, {reason}")
     for image, reason in estimate.apart.items():
         print_message("note", f"{estimate.name_of(image)} is in a smaller group: {reason}")
     for image, reason in estimate.unplaced.items():

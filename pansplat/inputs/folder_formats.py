@@ -37,10 +37,7 @@ from pansplat.inputs.placements import (
     ApproximatePlace,
     Placement,
     is_by_hand,
-    judge,
     read_approximate,
-    read_rejected,
-    read_ties,
     read_unit,
 )
 from pansplat.inputs.poses import (
@@ -57,7 +54,6 @@ from pansplat.system.files import read_file
 from pansplat.system.strict_json import read_field, read_json
 
 POSES, PAIRS = "poses.json", "pairs.json"
-_REJECTED = "rejected by hand"
 _MAX_WORLD = 9999  # of poses.json
 MATRIX_KEYS = ("cam2world", "world2cam", "pose")
 _IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # of a sequence
@@ -139,18 +135,15 @@ def _read_tour_of_folder(folder: Path) -> dict[str, Panorama]:
 
 def _judge_entries(content: dict[str, Any], panoramas: Sequence[Panorama], source: Path) -> list[Panorama]:
     """The panoramas of poses.json with their placements."""
-    entries = content["poses"]
-    by_hand = {name for name, entry in entries.items() if is_by_hand(entry)}
-    ties, placements = read_ties(content.get("estimate")), {}
-    for world in {panorama.world for panorama in panoramas}:
-        names = [name for name, view in zip(entries, panoramas, strict=True) if view.world == world]
-        placements |= judge(names, ties, by_hand, source)
-    rejected = {name for poses in read_rejected(content) for name in poses}
+    sizes, alone = Counter(view.world for view in panoramas), "no other panorama has a pose with it"
     return [
         dataclasses.replace(
-            panorama, placement=dataclasses.replace(placements[name], is_rejected=name in rejected - by_hand)
+            view,
+            placement=Placement("not placed", alone, source)
+            if sizes[view.world] == 1
+            else Placement("by hand" if is_by_hand(entry) else "placed", source=source),
         )
-        for name, panorama in zip(entries, panoramas, strict=True)
+        for entry, view in zip(content["poses"].values(), panoramas, strict=True)
     ]
 
 
@@ -158,8 +151,7 @@ def _read_reasons(content: dict[str, Any]) -> dict[str, str]:
     """Why panoramas have no pose, by the names of their files, as poses.json states it."""
     estimate = content.get("estimate")
     reasons = estimate.get("unplaced") if isinstance(estimate, dict) else None
-    rejected = [name for poses in read_rejected(content) for name in poses]
-    return (reasons if isinstance(reasons, dict) else {}) | dict.fromkeys(rejected, _REJECTED)
+    return reasons if isinstance(reasons, dict) else {}
 
 
 def _explain_unposed(
@@ -167,7 +159,7 @@ def _explain_unposed(
 ) -> Panorama:
     """A panorama beside those of poses.json, with the reason that it states."""
     reason = str(reasons.get(panorama.image.name, f"{POSES} has no pose of it"))
-    placement = Placement("not placed", reason, source, is_rejected=reason == _REJECTED, about=about)
+    placement = Placement("not placed", reason, source, about=about)
     return dataclasses.replace(panorama, placement=placement)
 
 

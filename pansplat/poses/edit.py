@@ -1,4 +1,4 @@
-"""Changes of a folder's poses by hand: poses that a user places, rejects and restores, in its poses.json.
+"""Changes of a folder's poses.json: poses that a user places by hand, and those of a new estimate.
 
 The first change of a folder whose poses were estimated writes all estimated poses to a poses.json; from then on the
 file counts. Other entries and fields of the file stay as they are. Each change is written at once and can be undone.
@@ -6,7 +6,6 @@ file counts. Other entries and fields of the file stay as they are. Each change 
 
 from __future__ import annotations
 
-import copy
 import itertools
 import os
 import warnings
@@ -26,12 +25,11 @@ from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.pairs import Panorama
-from pansplat.inputs.placements import BY_HAND, Tie, find_holds, is_by_hand, read_rejected, read_ties, read_unit
+from pansplat.inputs.placements import BY_HAND, list_approximate, read_unit
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.web_tours import is_scene_of_tour
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
-from pansplat.poses.placing import PlanPose, Suggestion
 from pansplat.poses.pose_file import (
     format_pose_file,
     make_pose_content,
@@ -101,18 +99,6 @@ class PoseEditor:
         (source,) = self._sources
         return _convert(read_entry(source), self._names, self._by_name)
 
-    def read_suggestions(self) -> dict[tuple[Path, Path], tuple[Suggestion, ...]]:
-        """For pairs of panoramas, places of the second one relative to the first, camera heights."""
-        images = {name: image for image, name in self._names.items()}
-        pairs, found = _read_estimate(self.read()).get("suggestions"), {}
-        for pair in pairs if isinstance(pairs, list) else []:
-            names, places = (pair.get("between"), pair.get("places")) if isinstance(pair, dict) else (None, None)
-            if not (isinstance(names, list) and len(names) == 2 and set(map(str, names)) <= set(images)):
-                continue
-            rows = [row for row in places if _is_row(row)] if isinstance(places, list) else []
-            found[images[names[0]], images[names[1]]] = tuple(Suggestion(PlanPose(*row[:3]), row[3]) for row in rows)
-        return found
-
     def read_unit(self, world: int) -> float | None:
         """Metres that are one camera height of the estimated depths in a world, if the file states it."""
         return read_unit(self.read(), world)
@@ -131,65 +117,7 @@ class PoseEditor:
             if unit is not None:
                 _list_worlds(content, world)[world]["unit"] = round(unit, 4)
         for image, pose in poses.items():
-            name = self._names[image]
-            if name in (rejected := _find_rejected(content)):
-                content["poses"].setdefault(name, copy.deepcopy(rejected[name]))
-            _put(content, name, pose, world, self.file, {"placed": BY_HAND})
-        self._write(content)
-
-    def reject(self, image: Path) -> None:
-        """Drop the pose of a panorama that is probable or placed by hand, and what only its pairs hold.
-
-        Panoramas that leave their group together get a world of their own.
-        """
-        content, name = self.read(), self._names[image]
-        poses = content["poses"]
-        if name not in poses:
-            raise InputError(f"{self.file}: needed a panorama with a pose to reject it, got {name}.")
-        ties: tuple[Tie, ...] = ()
-        members: tuple[str, ...] = (name,)
-        if not is_by_hand(poses[name]):
-            names = [other for other in poses if world_of(poses[other]) == world_of(poses[name])]
-            by_hand = [other for other in names if is_by_hand(poses[other])]
-            hold = find_holds(names, read_ties(content.get("estimate")), by_hand).get(name)
-            if hold is None:
-                raise InputError(
-                    f"{self.file}: needed a pose that is probable or placed by hand, got {name}; place it."
-                )
-            ties, members = hold.ties, hold.members
-        if len(members) == len(poses):
-            raise InputError(f"{self.file}: needed another panorama with a pose, got only {name}.")
-        record: Content = {"poses": {member: copy.deepcopy(poses[member]) for member in members}}
-        if ties:
-            record["pairs"] = _take_pairs(content, ties)
-        if len(members) == 1:
-            del poses[name]
-        else:
-            record["world"] = _find_free_world(content)
-            for member in members:
-                poses[member] = _as_object(poses[member], content, self.file) | {"world": record["world"]}
-        content["rejected"] = [*(content.get("rejected") or []), record]
-        self._write(content)
-
-    def restore(self, image: Path) -> None:
-        """Take back the last rejection of a panorama, also of those that left their group with it.
-
-        A panorama that was placed otherwise since stays where it is.
-        """
-        content, name = self.read(), self._names[image]
-        records = content.get("rejected") or []
-        found = [record for record in records if isinstance(record, dict) and name in (record.get("poses") or ())]
-        if not found:
-            raise InputError(f"{self.file}: needed a rejected panorama, got {name}.")
-        record, poses = found[-1], content["poses"]
-        for member, entry in record["poses"].items():
-            if member not in poses or ("world" in record and world_of(poses[member]) == record["world"]):
-                poses[member] = entry
-        if record.get("pairs"):
-            content.setdefault("estimate", {}).setdefault("pairs", []).extend(record["pairs"])
-        content["rejected"] = [other for other in records if other is not record]
-        if not content["rejected"]:
-            del content["rejected"]
+            _put(content, self._names[image], pose, world, self.file, {"placed": BY_HAND})
         self._write(content)
 
     def undo(self) -> None:
@@ -247,16 +175,16 @@ def merge_estimate(
         file: the poses.json.
         estimate: of panoramas.
         names: of the files in it.
-        overwrite: whether all poses are replaced that the estimate has, but for rejected ones.
+        overwrite: whether all poses are replaced that the estimate has.
     """
     content = read_pose_content(file)
-    poses, own, rejected = content["poses"], _find_own_worlds(content), set(_find_rejected(content))
+    poses, own = content["poses"], _find_own_worlds(content)
     placed = {names[image] for group in estimate.groups for image in group.poses}
-    kept = find_kept(content, file, names.values(), placed - rejected if overwrite else ())
+    kept = find_kept(content, file, names.values(), placed if overwrite else ())
     former = {name: poses.pop(name) for name in list(poses) if name not in kept}
     for group in estimate.groups:
-        new = {image: names[image] for image in group.poses if names[image] not in kept | rejected}
-        anchors = {image: names[image] for image in group.poses if names[image] in kept - rejected}
+        new = {image: names[image] for image in group.poses if names[image] not in kept}
+        anchors = {image: names[image] for image in group.poses if names[image] in kept}
         world = None if anchors else _find_free_world(content, [former[n] for n in new.values() if n in former])
         if new and world is not None:
             worlds, made = _list_worlds(content, world), make_range(group)
@@ -279,19 +207,11 @@ def merge_estimate(
             poses[name] = entry | {"world": _find_free_world(content)}
     fresh, old = make_pose_content(estimate, names)["estimate"], _read_estimate(content)
     read, files = set(names.values()), {image.name for image in names}
-    apart = {frozenset(tie[:2]) for record in content.get("rejected") or () for tie in read_ties(record)}
-    pairs = [pair for pair in _list_pairs(old) if set(pair["between"]) <= kept]
-    pairs += [
-        pair for pair in fresh["pairs"] if not set(pair["between"]) <= kept and frozenset(pair["between"]) not in apart
-    ]
     unplaced = old["unplaced"].items() if isinstance(old.get("unplaced"), dict) else ()
     content["estimate"] = {
         **old,
         **fresh,
-        "pairs": pairs,
-        "suggestions": [pair for pair in _list_pairs(old, "suggestions") if not set(pair["between"]) <= read]
-        + fresh["suggestions"],
-        "approximate": [pair for pair in _list_pairs(old, "approximate") if not set(pair["between"]) <= read]
+        "approximate": [entry for entry, stated in list_approximate(old) if not set(stated.between) <= read]
         + fresh["approximate"],
         "unplaced": {name: reason for name, reason in unplaced if name not in files} | fresh["unplaced"],
         "written": " ".join(mark for world, mark in mark_worlds(content).items() if world in own),
@@ -359,17 +279,11 @@ def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, P
     worlds = [
         world | {"poses": {rename(name): pose for name, pose in world["poses"].items()}} for world in cached["worlds"]
     ]
-    renamed = {
-        key: [pair | {k: [*map(rename, pair[k])] for k in ("between", "by") if k in pair} for pair in cached[key]]
-        for key in ("pairs", "suggestions", "approximate")
-    }
+    approximate = [
+        about | {key: [*map(rename, about[key])] for key in ("between", "by")} for about in cached["approximate"]
+    ]
     unplaced = {by_name[name].name if name in by_name else name: reason for name, reason in cached["unplaced"].items()}
-    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, **renamed})
-
-
-def _is_row(row: Any) -> bool:
-    is_list = isinstance(row, list) and len(row) == 4
-    return is_list and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in row)
+    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, "approximate": approximate})
 
 
 def _find_free_world(content: Content, former: Sequence[Any] = ()) -> int:
@@ -394,12 +308,6 @@ def _find_own_worlds(content: Content) -> set[int]:
     """The worlds whose poses are as an estimate wrote them."""
     marks = str(_read_estimate(content).get("written")).split()
     return {world for world, mark in mark_worlds(content).items() if mark in marks}
-
-
-def _find_rejected(content: Content) -> Content:
-    """The entries of panoramas that were rejected, and not placed by hand since."""
-    entries = {name: entry for record in read_rejected(content) for name, entry in record.items()}
-    return {name: entry for name, entry in entries.items() if not is_by_hand(content["poses"].get(name))}
 
 
 def _convention_of(content: Content, file: Path) -> str:
@@ -429,20 +337,6 @@ def _put(
     if world or "world" in entry:
         entry["world"] = world
     content["poses"][name] = entry[key] if set(entry) == {convention.split()[0]} else entry
-
-
-def _take_pairs(content: Content, ties: Sequence[Tie]) -> list[Content]:
-    """The pairs of some ties, which are removed from the estimate."""
-    estimate, ends = content["estimate"], [set(tie[:2]) for tie in ties]
-    taken = [pair for pair in _list_pairs(estimate) if set(pair["between"]) in ends]
-    estimate["pairs"] = [pair for pair in estimate["pairs"] if pair not in taken]
-    return taken
-
-
-def _list_pairs(estimate: Content, key: str = "pairs") -> list[Content]:
-    """The valid pairs of an estimate, or its "suggestions" or "approximate", as the file has them."""
-    pairs = estimate.get(key)
-    return [pair for pair in pairs if read_ties({"pairs": [pair]})] if isinstance(pairs, list) else []
 
 
 def _read(file: Path) -> bytes | None:

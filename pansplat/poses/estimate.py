@@ -19,7 +19,6 @@ from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
 from pansplat.inputs.pairs import FAR, NEAR, find_mask
-from pansplat.inputs.placements import Tie, find_holds
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.approximate import LinkedPlace, place_linked
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes
@@ -44,7 +43,7 @@ from pansplat.poses.learned import (
 )
 from pansplat.poses.learned import default_weights as default_matcher
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
-from pansplat.poses.placing import DEPTH_HEIGHT, PlanFrame, Suggestion, list_suggestions, make_piece
+from pansplat.poses.placing import DEPTH_HEIGHT, PlanFrame, make_piece
 from pansplat.poses.tour import Group, IndexPair, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose, estimate_relative_pose, polish_relative_pose
 from pansplat.poses.world import FLOOR_HEIGHT, depth_range, find_common_height, find_floors, level_poses
@@ -85,7 +84,6 @@ _ADVICE = (
     "pansplat-view"
 )
 
-Suggestions = dict[tuple[Path, Path], tuple[Suggestion, ...]]
 """For pairs of files, places of the second panorama relative to the first one, best first."""
 
 
@@ -124,8 +122,6 @@ class PoseEstimate:
         groups: of panoramas that reliable pairs connect, the largest one first; each has a world of its own.
         unplaced: the reason for each file without a pose.
         relations: of the pairs that were compared, by indices into `images`.
-        rejected: pairs of them that contradict the others and are not used.
-        suggestions: for placing by hand.
         names: of the files, for messages; by default their own.
         approximate: about where files without a pose are, by links.
     """
@@ -134,8 +130,6 @@ class PoseEstimate:
     groups: tuple[PoseGroup, ...]
     unplaced: dict[Path, str]
     relations: dict[IndexPair, RelativePose]
-    rejected: tuple[IndexPair, ...] = ()
-    suggestions: Suggestions = field(default_factory=dict)
     names: Mapping[Path, str] = field(default_factory=dict)
     approximate: Mapping[Path, LinkedPlace] = field(default_factory=dict)
 
@@ -159,26 +153,6 @@ class PoseEstimate:
             for image in group.poses:
                 others = ", ".join(self.name_of(other) for other in group.poses if other != image)
                 found[image] = f"it has a pose with {others} only"
-        return found
-
-    def list_ties(self, names: Mapping[Path, str]) -> list[Tie]:
-        """The pairs that hold the groups together, by the names of their files."""
-        ties = []
-        for (i, j), relation in self.relations.items():
-            ends = self.images[i], self.images[j]
-            is_used = relation.is_reliable and (i, j) not in self.rejected
-            if is_used and any(all(end in group.poses for end in ends) for group in self.groups):
-                ties.append(Tie(names[ends[0]], names[ends[1]], relation.is_certain))
-        return ties
-
-    @property
-    def probable(self) -> dict[Path, str]:
-        """For each file that only probable pairs connect with the core of its group, these pairs."""
-        names = {image: self.name_of(image) for image in self.images}
-        ties, found = self.list_ties(names), {}
-        for group in self.groups:
-            holds = find_holds([names[image] for image in group.poses], ties)
-            found |= {image: holds[names[image]].reason for image in group.poses if names[image] in holds}
         return found
 
     @property
@@ -320,9 +294,8 @@ def estimate_poses(
             say_detail(f"{listed[position]} and {listed[other]}", figures)
         unplaced[kept[position]] = _describe_mirrored(position, views, placed, listed) or reason + partner
     files = [paths[n] for n in kept]
-    suggestions = _suggest(views, relations, files)
     if not tour.groups:
-        raise _no_poses(paths, names, unplaced, suggestions, _place_linked(views, files, links, ()))
+        raise _no_poses(paths, names, unplaced, _place_linked(views, files, links, ()))
     report_progress("finding the floor", 0.95)
     groups = [
         _finish_group(
@@ -341,8 +314,6 @@ def estimate_poses(
         tuple(groups),
         {paths[n]: unplaced[n] for n in sorted(unplaced)},
         {(kept[i], kept[j]): relation for (i, j), relation in (relations | tour.confirmed).items()},
-        tuple((kept[i], kept[j]) for i, j in tour.rejected),
-        suggestions,
         names,
         _place_linked(views, files, links, groups),
     )
@@ -362,15 +333,6 @@ def _place_linked(
         frame = PlanFrame.of_world(np.stack(list(poses.values())), 1.0)
         worlds.append({file: frame.find_place(pose, pieces[file].upright) for file, pose in poses.items()})
     return place_linked(pieces, links, worlds)
-
-
-def _suggest(views: Sequence[_View], relations: Mapping[IndexPair, RelativePose], files: Sequence[Path]) -> Suggestions:
-    """The suggestions of all pairs that have some."""
-    found = {}
-    for (i, j), relation in relations.items():
-        upright = views[i].surroundings.depth.rotation, views[j].surroundings.depth.rotation
-        found[files[i], files[j]] = list_suggestions(relation, upright)
-    return {pair: suggestions for pair, suggestions in found.items() if suggestions}
 
 
 def _finish_group(
@@ -401,31 +363,28 @@ class NoPosesError(InputError):
 
     Attributes:
         reasons: for each file.
-        suggestions: for placing by hand.
         approximate: about where files are, relative to each other.
     """
 
     def __init__(
         self,
         reasons: Mapping[Path, str],
-        suggestions: Suggestions | None = None,
         names: Mapping[Path, str] | None = None,
         approximate: Mapping[Path, LinkedPlace] | None = None,
     ) -> None:
         listed = "; ".join(f"{(names or {}).get(path, path.name)}: {reason}" for path, reason in reasons.items())
-        advice = "" if suggestions is None else f"; {_ADVICE}"
+        advice = "" if approximate is None else f"; {_ADVICE}"
         super().__init__(f"no poses were found: {listed}{advice}.")
-        self.reasons, self.suggestions, self.approximate = dict(reasons), suggestions or {}, approximate or {}
+        self.reasons, self.approximate = dict(reasons), approximate or {}
 
 
 def _no_poses(
     paths: Sequence[Path],
     names: Mapping[Path, str],
     reasons: Mapping[int, str],
-    suggestions: Suggestions | None = None,
     approximate: Mapping[Path, LinkedPlace] | None = None,
 ) -> NoPosesError:
-    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, suggestions, names, approximate)
+    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, names, approximate)
 
 
 def _read_images(

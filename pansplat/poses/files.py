@@ -17,7 +17,7 @@ from pansplat.images.image_files import is_assembled, read_thumbnail
 from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.folders import make_names_unique
 from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
-from pansplat.inputs.placements import Placement, judge, read_approximate, read_ties
+from pansplat.inputs.placements import Placement, read_approximate
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.edit import POSES, find_kept, merge_estimate, name_pictures, read_pose_content, write_pose_file
@@ -25,8 +25,6 @@ from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses, 
 from pansplat.poses.pose_file import (
     CONVENTION,
     list_approximate,
-    list_pairs,
-    list_suggestions,
     make_pose_content,
     make_world,
 )
@@ -153,13 +151,10 @@ def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float)
     try:
         estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height)
     except NoPosesError as error:
-        worlds, summary, unplaced, pairs = [], "", error.reasons, []
-        suggestions, approximate = error.suggestions, error.approximate
+        worlds, summary, unplaced, approximate = [], "", error.reasons, error.approximate
     else:
         worlds = [make_world(group, names) for group in estimate.groups]
-        summary, unplaced, suggestions = estimate.summary, estimate.unplaced, estimate.suggestions
-        approximate = estimate.approximate
-        pairs = list_pairs(estimate, names)
+        summary, unplaced, approximate = estimate.summary, estimate.unplaced, estimate.approximate
     unreadable = [image for image in unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
         raise NoPosesError(unplaced)
@@ -168,8 +163,6 @@ def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float)
         "summary": summary,
         "unplaced": {names[image]: reason for image, reason in unplaced.items()},
         "unreadable": [names[image] for image in unreadable],
-        "pairs": pairs,
-        "suggestions": list_suggestions(suggestions, names),
         "approximate": list_approximate(approximate, names),
     }
 
@@ -203,23 +196,16 @@ def _make_pairs(
         panorama = by_name[name]
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
         warnings.warn(f"{_describe(panorama, folder)} {outcome}: {reason}", InputWarning, stacklevel=4)
-    pairs, ties = [], read_ties(content)
+    pairs = []
     units = {name: world["unit"] for world in content["worlds"] for name in world["poses"]}
     about = read_approximate(content, {name: view.image for name, view in by_name.items()}, units)
     for number, world in enumerate(content["worlds"]):
-        placements = judge(list(world["poses"]), ties, (), source)
-        for name, placement in placements.items():
-            if placement.state == "probable":
-                view = by_name[name]
-                outcome = "is only probably placed, and can be rejected in pansplat-view"
-                message = f"{_describe(view, folder)} {outcome}: {placement.reason}"
-                warnings.warn(message, InputWarning, stacklevel=4)
         placed = tuple(
             replace(
                 by_name[name],
                 cam2world=to_cam2world(rigid_matrix(pose, str(source)), CONVENTION),
                 world=number,
-                placement=placements[name],
+                placement=Placement(source=source),
             )
             for name, pose in world["poses"].items()
         )

@@ -1,4 +1,4 @@
-"""Panoramas as pieces on a floor plan: their places, what snaps, and how well a place fits the panoramas around it.
+"""Panoramas as pieces on a floor plan: what each shows, and where it is behind a door of another one.
 
 A piece is a panorama with its estimated depth. Its place is a point on the plan and a heading, because gravity is known
 and cameras of a tour are equally high. Units of a plan are metres; those of a piece are camera heights.
@@ -23,37 +23,27 @@ from numpy import ndarray as Array
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import level_pose, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.pairs import Link, Panorama
 from pansplat.poses.axes import SceneAxes, find_axes
-from pansplat.poses.dense import Comparison, Surroundings, compare
+from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import estimate_depth
-from pansplat.poses.two_view import RelativePose
 from pansplat.tours.floor import find_ceiling, trace_floor
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _IMAGE_HEIGHT = 1024  # largest one, in which edges are looked for
 _OUTLINE_STEP = 2  # of the pixels that an outline is traced from, rows and columns
 _UPRIGHT = math.radians(8)  # between a world's y axis and the mean down of its cameras, if y is down
-SNAP_RADIUS, SNAP_ANGLE = 0.35, math.radians(12)  # metres and radians, to a suggestion
-WALL_ANGLE = math.radians(6)  # to parallel walls
-POOR_FIT = 0.25  # quality below which a place is doubtful
-_LEAST_OVERLAP = 0.01  # of a comparison that counts
-_LIKENESS, _CONFLICT_WEIGHT = (0.05, 0.4), 5.0  # by chance, and at right poses of neighbours in zind (docs/poses.md)
-_LINK_REACH = 1.0, 4.0  # camera heights, of a place by a link
 _DOOR = math.radians(16)  # standard deviation of what counts in the direction of a door
 _LINTEL = 0.6, 0.95  # what is above doors and below the ceiling, fractions of the ceiling's height over the camera
 _WALL_TURN, _GRAZING = math.radians(25), 0.12  # of a surface and its wall; least cosine of a direction and a wall's
 _LEAST_WALL, _THICKNESS = 0.25, 0.08  # distance of a wall with a door, and its thickness, camera heights
 _ALIKE, _NO_DOOR = 7.65, 0.1  # weight of the likeness, as in the check of poses; weight of no common door
-_MOST_SUGGESTIONS = 4  # of a pair
-_NEIGHBOURS = 4  # nearest panoramas that a place is compared with
 
 
 class PlanPose(NamedTuple):
     """The pose of a camera on a floor plan, or relative to another one.
 
     Attributes:
-        right, forward: metres; of a `Suggestion` heights of the camera (`add` has its unit).
+        right, forward: metres; relative to a camera, its heights (`add` has the unit).
         yaw: heading, radians to the right of the plan's forward axis.
     """
 
@@ -86,77 +76,11 @@ class PlanPose(NamedTuple):
         return abs(wrap_angle(self.yaw - other.yaw))
 
 
-class Suggestion(NamedTuple):
-    """A place of one panorama relative to another one, camera heights, with the logarithm of its odds."""
-
-    place: PlanPose
-    log_odds: float
-
-
-def list_suggestions(
-    relation: RelativePose, upright: tuple[Float[Array, "3 3"], Float[Array, "3 3"]]
-) -> tuple[Suggestion, ...]:
-    """The best hypotheses of a pair as places of the second panorama relative to the first one.
-
-    Args:
-        relation: of the pair.
-        upright: axes of both upright cameras in the cameras' frames, as columns (`DepthMap.rotation`).
-    """
-    found, poses = [], relation.hypotheses
-    for n in np.argsort(-poses.log_odds, kind="stable")[:_MOST_SUGGESTIONS]:
-        if poses.log_odds[n] > -math.inf:
-            centre = upright[0].T @ (-poses.rotations[n].T @ poses.translations[n])
-            forward = upright[0].T @ poses.rotations[n].T @ upright[1][:, 2]
-            place = PlanPose(float(centre[0]), float(centre[2]), math.atan2(forward[0], forward[2]))
-            found.append(Suggestion(place, float(poses.log_odds[n])))
-    return tuple(found)
-
-
-def suggest_by_links(
-    first: Panorama, second: Panorama, upright: tuple[Float[Array, "3 3"], Float[Array, "3 3"]]
-) -> PlanPose | None:
-    """The place of the second panorama relative to the first one by the links of a tour, camera heights.
-
-    It is where a link meets the floor, 1 to 4 camera heights away. A link back states the heading. Without it the start
-    view looks onwards; without a start view, the middle of the picture. None without links.
-
-    Args:
-        first, second: names and links count.
-        upright: axes of both upright cameras in the cameras' frames, as columns (`DepthMap.rotation`).
-    """
-    there, back = _find_link(first, second), _find_link(second, first)
-    if there is None:
-        turned = None if back is None else suggest_by_links(second, first, (upright[1], upright[0]))
-        return None if turned is None else turned.inverse()
-    yaw, distance = _meet_floor(there.yaw, there.pitch, upright[0])
-    if back is not None:
-        heading = yaw + math.pi - _meet_floor(back.yaw, back.pitch, upright[1])[0]
-    else:
-        heading = yaw - (_meet_floor(*second.start, upright[1])[0] if second.start else 0.0)
-    return PlanPose(distance * math.sin(yaw), distance * math.cos(yaw), wrap_angle(heading))
-
-
 class Guess(NamedTuple):
     """A place of one panorama relative to another one, camera heights, with its probability."""
 
     place: PlanPose
     probability: float
-
-
-def suggest_through_door(first: Panorama, second: Panorama, pieces: tuple[Piece, Piece]) -> PlanPose | None:
-    """The place of the second panorama relative to the first one if their links lead to one door, camera heights.
-
-    It is the most probable one of `list_through_door`. None without links of both, or without walls.
-
-    Args:
-        first, second: names and links count.
-        pieces: of both.
-    """
-    there, back = _find_link(first, second), _find_link(second, first)
-    if there is None or back is None:
-        return None
-    guesses = list_through_door(pieces, ((there.yaw, there.pitch), (back.yaw, back.pitch)))
-    return max(guesses, key=lambda guess: guess.probability).place if guesses else None
 
 
 def list_through_door(
@@ -170,7 +94,7 @@ def list_through_door(
     Args:
         links: yaw and pitch of both directions, as of a `Link`.
     """
-    doors = [piece.find_doors(_meet_floor(*link, piece.upright)[0]) for piece, link in zip(pieces, links, strict=True)]
+    doors = [piece.find_doors(_level_yaw(*link, piece.upright)) for piece, link in zip(pieces, links, strict=True)]
     frame, found = PlanFrame(pieces[0].upright, 1.0), []
     for (there, share), (back, other) in itertools.product(*doors):
         right, forward = _THICKNESS * math.sin(there.yaw), _THICKNESS * math.cos(there.yaw)
@@ -184,16 +108,11 @@ def list_through_door(
     return [Guess(place, weight / total) for place, weight in found]
 
 
-def _find_link(start: Panorama, end: Panorama) -> Link | None:
-    return next((link for link in start.links if link.target == end.name), None)
-
-
-def _meet_floor(yaw: float, pitch: float, upright: Float[Array, "3 3"]) -> tuple[float, float]:
-    """Yaw of a direction of a camera for the upright camera, and the level distance to where it meets the floor."""
+def _level_yaw(yaw: float, pitch: float, upright: Float[Array, "3 3"]) -> float:
+    """Yaw of a direction of a camera for the upright camera."""
     level = math.cos(pitch)
-    right, down, forward = upright.T @ (level * math.sin(yaw), math.sin(pitch), level * math.cos(yaw))
-    distance = math.hypot(right, forward) / down if down > 0 else math.inf
-    return math.atan2(right, forward), min(max(distance, _LINK_REACH[0]), _LINK_REACH[1])
+    right, _, forward = upright.T @ (level * math.sin(yaw), math.sin(pitch), level * math.cos(yaw))
+    return math.atan2(right, forward)
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,105 +248,9 @@ class PlanFrame:
         return pose
 
 
-class Snapped(NamedTuple):
-    """A place after snapping.
-
-    Attributes:
-        suggestion: number of the suggestion that it is at; None for none.
-        is_aligned: whether only its walls were turned parallel to the plan's.
-    """
-
-    place: PlanPose
-    suggestion: int | None = None
-    is_aligned: bool = False
-
-
-def snap(
-    place: PlanPose, suggestions: Sequence[PlanPose], wall_yaw: float | None = None, target_yaw: float | None = None
-) -> Snapped:
-    """The nearest suggestion within reach, or else the place with its walls parallel to those of the plan.
-
-    Args:
-        place: of the piece.
-        suggestions: on the plan.
-        wall_yaw: of the piece (`Piece.wall_yaw`); None snaps no walls.
-        target_yaw: of the plan's walls, radians up to a quarter turn.
-    """
-    near = [
-        (place.distance(other) / SNAP_RADIUS + place.turn_between(other) / SNAP_ANGLE, number)
-        for number, other in enumerate(suggestions)
-        if place.distance(other) < SNAP_RADIUS and place.turn_between(other) < SNAP_ANGLE
-    ]
-    if near:
-        number = min(near)[1]
-        return Snapped(suggestions[number], number)
-    if wall_yaw is not None and target_yaw is not None:
-        error = math.remainder(place.yaw + wall_yaw - target_yaw, math.pi / 2)
-        if abs(error) < WALL_ANGLE:
-            return Snapped(place._replace(yaw=wrap_angle(place.yaw - error)), None, True)
-    return Snapped(place)
-
-
 def find_wall_yaw(yaws: Sequence[float]) -> float | None:
     """The mean of directions up to quarter turns, radians; None if there are none or they contradict each other."""
     if not yaws:
         return None
     mean = np.exp(4j * np.array(yaws)).mean()
     return float(np.angle(mean)) / 4 if abs(mean) > 0.5 else None
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well a piece at a place fits the panoramas around it.
-
-    Attributes:
-        likeness: correlation of the detail of what both see; mean over the panoramas, by overlap.
-        conflict: share of the sphere whose surface is where another camera sees through; likewise.
-        overlap: largest share of the sphere that both see.
-    """
-
-    likeness: float
-    conflict: float
-    overlap: float
-
-    @property
-    def score(self) -> float:
-        """About 0 by chance, and 1 at a right pose in one room."""
-        low, high = _LIKENESS
-        return (self.likeness - low) / (high - low) - _CONFLICT_WEIGHT * self.conflict
-
-    @property
-    def quality(self) -> float:
-        """The score within 0 to 1."""
-        return min(max(self.score, 0.0), 1.0)
-
-
-def measure_fit(
-    piece: Piece,
-    pose: Float[Array, "4 4"],
-    others: Sequence[tuple[Piece, Float[Array, "4 4"]]],
-    unit: float,
-) -> Fit | None:
-    """The fit of a piece at a pose with the nearest other panoramas; None if it has nothing in common with them.
-
-    Args:
-        piece: of the panorama.
-        pose: its cam2world.
-        others: pieces and poses of panoramas of the same world.
-        unit: metres that are one camera height.
-    """
-    nearest = sorted(others, key=lambda other: float(np.linalg.norm(other[1][:3, 3] - pose[:3, 3])))[:_NEIGHBOURS]
-    found: list[Comparison] = []
-    for other, known in nearest:
-        rotation = pose[:3, :3].T @ known[:3, :3]
-        translation = pose[:3, :3].T @ (known[:3, 3] - pose[:3, 3]) / unit
-        found.append(compare(other.surroundings, piece.surroundings, rotation, translation))
-    weights = np.array([comparison.overlap for comparison in found])
-    if not len(found) or weights.max() < _LEAST_OVERLAP:
-        return None
-    likeness, conflict = (np.array([getattr(c, name) for c in found]) for name in ("likeness", "conflict"))
-    return Fit(
-        float((weights * likeness).sum() / weights.sum()),
-        float((weights * conflict).sum() / weights.sum()),
-        float(weights.max()),
-    )

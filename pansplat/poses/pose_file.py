@@ -14,21 +14,19 @@ import numpy as np
 from pansplat.inputs.folder_formats import MATRIX_KEYS
 from pansplat.inputs.placements import is_by_hand
 from pansplat.poses.approximate import LinkedPlace
-from pansplat.poses.estimate import PoseEstimate, PoseGroup, Suggestions
+from pansplat.poses.estimate import PoseEstimate, PoseGroup
 
 CONVENTION = "cam2world opencv"
 
 
 def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
-    """The content of a poses.json: the poses of all groups (a world each), their pairs, and suggestions."""
+    """The content of a poses.json: the poses of all groups (a world each), and approximate places."""
     worlds = [make_world(group, names) for group in estimate.groups]
     return make_pose_file(
         worlds,
         {
             "summary": estimate.summary,
             "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
-            "pairs": list_pairs(estimate, names),
-            "suggestions": list_suggestions(estimate.suggestions, names),
             "approximate": list_approximate(estimate.approximate, names),
         },
     )
@@ -65,25 +63,6 @@ def mark_worlds(content: Mapping[str, Any]) -> dict[int, str]:
     return {
         world: hashlib.blake2b(json.dumps(state).encode(), digest_size=8).hexdigest() for world, state in states.items()
     }
-
-
-def list_pairs(estimate: PoseEstimate, names: Mapping[Path, str]) -> list[dict[str, Any]]:
-    """The pairs that hold the groups together, and how certain they are."""
-    return [
-        {"between": [tie.first, tie.second], "check": "certain" if tie.is_certain else "probable"}
-        for tie in estimate.list_ties(names)
-    ]
-
-
-def list_suggestions(suggestions: Suggestions, names: Mapping[Path, str]) -> list[dict[str, Any]]:
-    """Places of the second panorama of a pair relative to the first: right, forward (camera heights), yaw, log-odds."""
-    return [
-        {
-            "between": [names[first], names[second]],
-            "places": [[round(x, 4) for x in (*s.place, s.log_odds)] for s in own],
-        }
-        for (first, second), own in suggestions.items()
-    ]
 
 
 def list_approximate(places: Mapping[Path, LinkedPlace], names: Mapping[Path, str]) -> list[dict[str, Any]]:

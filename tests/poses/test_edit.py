@@ -1,4 +1,4 @@
-"""Rejecting, restoring and placing by hand change poses.json only where they must, survive loading, and are undone."""
+"""Placing by hand and new estimates change poses.json only where they must, survive loading, and are undone."""
 
 import json
 import os
@@ -17,33 +17,23 @@ from pansplat.poses.approximate import LinkedPlace
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.files import write_poses
-from pansplat.poses.placing import PlanPose, Suggestion
-from pansplat.poses.two_view import RelativePose
+from pansplat.poses.placing import PlanPose
 
 NAMES = "abcdef"
 
 
-def _relation(log_odds: float) -> RelativePose:
-    none = np.zeros((0, 2), np.int64)
-    figures = {"score": 100, "margin": 100, "places": 40, "uncertainty": (0.01, 0.01), "distance": 1.0}
-    return RelativePose(np.eye(3), np.array((0.0, 0, 1)), none, log_odds=log_odds, **figures)
-
-
 def _estimate(images, **options) -> PoseEstimate:
-    """a, b, c (certain), d probable by c, e probable by d; f is not placed. Cameras are 1 m apart along x."""
+    """Poses of a to e, 1 m apart along x; f is not placed."""
     images = list(images)
     poses = {}
     for step, image in enumerate(images[:5]):
         poses[image] = np.eye(4)
         poses[image][0, 3] = step
-    odds = {(0, 1): np.inf, (1, 2): 3.0, (2, 3): 0.5, (3, 4): 0.5}
     return PoseEstimate(
         tuple(images),
         (PoseGroup(poses, 0.4, 8.0, 0.0, "a test", 1.6),),
         {images[5]: "no door"} if len(images) > 5 else {},
-        {pair: _relation(value) for pair, value in odds.items() if max(pair) < len(images)},
-        (),
-        {(images[0], images[5]): (Suggestion(PlanPose(1.0, 2.0, 0.5), -1.5),)} if len(images) > 5 else {},
+        {},
         approximate={images[5]: LinkedPlace(images[0], PlanPose(1.0, 2.0, 0.5), (images[1],))}
         if len(images) > 5
         else {},
@@ -78,14 +68,13 @@ def _content(folder: Path) -> dict:
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
-ALL = {"a": "placed", "b": "placed", "c": "placed", "d": "probable", "e": "probable", "f": "not placed"}
+ALL = {"a": "placed", "b": "placed", "c": "placed", "d": "placed", "e": "placed", "f": "not placed"}
 
 
 def test_states_and_reasons_are_those_of_the_estimate_also_from_its_cache_and_from_a_file(folder: Path, monkeypatch):
     for _ in range(2):
         views = _load(folder)
         assert _states(folder) == ALL
-        assert views["d"].placement.reason == "by probable pairs only: c - d"
         assert views["f"].placement.reason == "no door"
         monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)
     write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
@@ -93,45 +82,18 @@ def test_states_and_reasons_are_those_of_the_estimate_also_from_its_cache_and_fr
     assert _load(folder)["f"].placement.reason == "no door"
 
 
-def test_a_note_names_what_is_only_probable(folder: Path):
-    with pytest.warns(UserWarning, match=r"d\.png is only probably placed.*by probable pairs only: c - d"):
-        pansplat.load_pairs(folder)
-    estimate = _estimate(sorted(folder.glob("*.png")))
-    assert {image.name: reason for image, reason in estimate.probable.items()} == {
-        "d.png": "by probable pairs only: c.png - d.png",
-        "e.png": "by probable pairs only: d.png - e.png",
-    }
+def test_rejections_and_suggestions_of_earlier_versions_are_ignored_and_kept(folder: Path):
+    def change(content: dict) -> None:
+        pose = content["poses"].pop("e.png")
+        content["rejected"] = [{"poses": {"e.png": pose}, "pairs": [{"between": ["d.png", "e.png"]}], "world": 1}]
+        content["estimate"]["suggestions"] = [{"between": ["a.png", "f.png"], "places": [[1.0, 2.0, 0.5, -1.5]]}]
 
-
-def test_a_rejected_leaf_has_no_pose_after_loading_and_can_be_restored(folder: Path):
-    editor = _edit(folder)
-    editor.reject(folder / "e.png")
+    content = _write_edited(folder, change)
     view = _load(folder)["e"]
-    assert view.placement.state == "not placed" and view.placement.reason == "rejected by hand"
-    assert view.placement.is_rejected and view.world != _load(folder)["a"].world
-    assert _states(folder) == ALL | {"e": "not placed"}
-    again = _edit(folder)  # another session
-    again.restore(folder / "e.png")
-    assert _states(folder) == ALL
-    assert _load(folder)["e"].cam2world[0, 3] == 4 and "rejected" not in _content(folder)
-
-
-def test_what_a_rejected_pair_holds_leaves_together_and_comes_back_together(folder: Path):
-    editor = _edit(folder)
-    editor.reject(folder / "d.png")
-    views = _load(folder)
-    assert views["d"].world == views["e"].world != views["a"].world
-    assert np.allclose(views["e"].cam2world[:3, 3] - views["d"].cam2world[:3, 3], (1, 0, 0))
-    assert views["d"].placement.is_rejected
-    _edit(folder).restore(folder / "d.png")
-    assert len({view.world for name, view in _load(folder).items() if name != "f"}) == 1
-    assert _states(folder) == ALL
-
-
-def test_a_certain_pose_is_not_rejected(folder: Path):
-    with pytest.raises(InputError, match="needed a pose that is probable or placed by hand, got b"):
-        _edit(folder).reject(folder / "b.png")
-    assert not (folder / "poses.json").exists()
+    assert (view.placement.state, view.placement.reason) == ("not placed", "poses.json has no pose of it")
+    _edit(folder).place({folder / "e.png": np.eye(4)}, 0)
+    assert _states(folder) == ALL | {"e": "by hand"}
+    assert _content(folder)["rejected"] == content["rejected"]
 
 
 def test_a_pose_placed_by_hand_is_in_the_world_of_the_others_and_undone_in_steps(folder: Path):
@@ -143,21 +105,13 @@ def test_a_pose_placed_by_hand_is_in_the_world_of_the_others_and_undone_in_steps
     view = _load(folder)["f"]
     assert view.placement.state == "by hand" and view.world == world
     assert np.allclose(view.cam2world.numpy(), pose)
-    editor.reject(folder / "e.png")
+    editor.place({folder / "e.png": pose}, world)
     editor.undo()
     assert (folder / "poses.json").read_bytes() == first
     editor.undo()
     assert not (folder / "poses.json").exists() and not editor.can_undo
     with pytest.raises(InputError, match="needed a change to undo"):
         editor.undo()
-
-
-def test_a_pose_placed_by_hand_can_be_rejected_and_restored(folder: Path):
-    _edit(folder).place({folder / "f.png": np.eye(4)}, 0)
-    _edit(folder).reject(folder / "f.png")
-    assert _states(folder) == ALL
-    _edit(folder).restore(folder / "f.png")
-    assert _states(folder) == ALL | {"f": "by hand"}
 
 
 def test_saving_keeps_other_entries_fields_and_the_convention(folder: Path):
@@ -205,7 +159,7 @@ def test_a_change_of_another_program_is_kept(folder: Path):
     (folder / "poses.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="needed the file as it was written"):
         editor.undo()
-    editor.reject(folder / "e.png")
+    editor.place({folder / "e.png": np.eye(4)}, 0)
     assert _content(folder)["remark"] == "mine"
 
 
@@ -219,7 +173,7 @@ def test_a_failed_write_names_the_file_and_leaves_the_old_one(folder: Path, monk
 
     monkeypatch.setattr(os, "replace", refuse)
     with pytest.raises(InputError, match=r"cannot write .*poses\.json: needed a writable folder.*Permission denied"):
-        editor.reject(folder / "f.png")
+        editor.place({folder / "e.png": np.eye(4)}, 0)
     assert (folder / "poses.json").read_bytes() == before
     assert {file.suffix for file in folder.iterdir() if file.is_file()} == {".png", ".json"}
 
@@ -232,24 +186,14 @@ def test_a_damaged_file_is_named_and_kept(folder: Path):
     assert (folder / "poses.json").read_text() == '{"poses": '
 
 
-def test_photographs_without_any_pose_get_a_world_of_their_own(folder: Path):
+def test_photographs_placed_beside_each_other_only_get_a_world_of_their_own(folder: Path):
     editor, pose = _edit(folder), np.eye(4)
     pose[0, 3] = 1.5
-    editor.reject(folder / "e.png")
     editor.place({folder / "e.png": np.eye(4), folder / "f.png": pose}, None, 1.4)
     views = _load(folder)
     assert views["e"].world == views["f"].world != views["a"].world
     assert _states(folder) == ALL | {"e": "by hand", "f": "by hand"}
     assert editor.read_unit(views["f"].world) == 1.4 and editor.read_unit(0) == 1.6
-
-
-def test_suggestions_are_kept_from_the_cache_to_the_file(folder: Path):
-    for _ in range(2):
-        editor = _edit(folder)
-        assert editor.read_suggestions() == {
-            (folder / "a.png", folder / "f.png"): (Suggestion(PlanPose(1.0, 2.0, 0.5), -1.5),)
-        }
-        editor.place({folder / "e.png": np.eye(4)}, 0)
 
 
 def test_an_approximate_place_is_kept_from_the_cache_to_the_file_and_a_place_by_hand_replaces_it(folder: Path):
@@ -274,20 +218,20 @@ def test_an_approximate_place_is_kept_from_the_cache_to_the_file_and_a_place_by_
 
 
 def test_a_new_estimate_keeps_the_poses_by_hand_and_adds_others_beside_them(folder: Path):
-    """The new estimate has its origin elsewhere; e, whose pair was rejected, stays without a pose."""
+    """The new estimate has its origin elsewhere."""
     editor, pose = _edit(folder), np.eye(4)
     pose[:3, 3] = 0, 0, 3
-    editor.reject(folder / "e.png")
     editor.place({folder / "b.png": pose}, 0)
     content = _content(folder)
     del content["poses"]["c.png"]
     content["worlds"][0]["unit"] = 3.2  # metres, twice those of the new estimate
     (folder / "poses.json").write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match=r"keeps its poses of a\.png, b\.png, d\.png: .*`--overwrite` replaces them"):
+    with pytest.warns(
+        UserWarning, match=r"keeps its poses of a\.png, b\.png, d\.png, e\.png: .*`--overwrite` replaces them"
+    ):
         write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
     views = _load(folder)
     assert np.allclose(views["b"].cam2world.numpy(), pose) and views["b"].placement.state == "by hand"
-    assert "e.png" not in _content(folder)["poses"]
     assert np.allclose(views["c"].cam2world[:3, 3], (2, 0, 3))  # beside b, the nearest one
 
 
@@ -296,6 +240,7 @@ def test_all_groups_of_an_estimate_are_written(folder: Path):
     poses = [{image: np.eye(4) for image in part} for part in (images[:2], images[2:4])]
     groups = tuple(PoseGroup(own, 0.3 + n, 8.0 + n, 0.0, "a test") for n, own in enumerate(poses))
     write_poses(PoseEstimate(tuple(images), groups, {}, {}), folder / "poses.json")
+    assert _states(folder) == dict.fromkeys("abcd", "placed") | dict.fromkeys("ef", "not placed")
     pairs = pansplat.load_pairs(folder)
     assert [[view.world for view in pair.context] for pair in pairs[:2]] == [[0, 0], [1, 1]]
     assert [(pair.near, pair.far) for pair in pairs[:2]] == [(0.3, 8), (1.3, 9)]
@@ -309,7 +254,7 @@ def _scaled(factor: float, images: list[Path], start: int = 0) -> PoseEstimate:
         pose[:3, 3] *= factor
     group = PoseGroup(poses, round(0.4 * factor, 3), 8.0 * factor, 0.0, "a test", 1.6 * factor)
     unplaced = found.unplaced | dict.fromkeys(images[:start], "no wall")
-    return PoseEstimate(found.images, (group,), unplaced, found.relations, (), found.suggestions)
+    return PoseEstimate(found.images, (group,), unplaced, found.relations)
 
 
 def _write_edited(folder: Path, change) -> dict:
@@ -461,7 +406,6 @@ def test_poses_of_panoramas_that_are_not_read_stay_and_hold_the_others(folder: P
     views = _load(folder)
     assert [views[name].cam2world[0, 3].item() for name in "abcdef"] == [0, 1, 2, 3, 4, 5]
     assert len({view.world for view in views.values()}) == 1
-    assert _content(folder)["estimate"]["pairs"][0]["between"] == ["a.png", "b.png"]
 
 
 def test_a_panorama_that_was_removed_does_not_hold_the_others(folder: Path):
@@ -471,19 +415,6 @@ def test_a_panorama_that_was_removed_does_not_hold_the_others(folder: Path):
     write_poses(_scaled(2, images[:4]), folder / "poses.json")
     assert [_load(folder)[name].cam2world[0, 3].item() for name in "abcd"] == [0, 2, 4, 6]
     assert "e.png" not in _content(folder)["poses"]
-
-
-def test_a_rejected_pose_that_is_placed_by_hand_keeps_its_room_and_mask(folder: Path):
-    cv2.imwrite(str(folder / "own.jpg"), np.full((8, 16, 3), 255, np.uint8))
-
-    def change(content: dict) -> None:
-        content["poses"]["e.png"] = {"cam2world": content["poses"]["e.png"], "room": "Hall", "mask": "own.jpg"}
-
-    _write_edited(folder, change)
-    editor = _edit(folder)
-    editor.reject(folder / "e.png")
-    editor.place({folder / "e.png": np.eye(4)}, 0)
-    assert (_load(folder)["e"].title, _load(folder)["e"].mask) == ("Hall", folder / "own.jpg")
 
 
 def test_the_first_change_by_hand_keeps_the_old_file(folder: Path):

@@ -1,7 +1,7 @@
 """The floor plan of a tour as a panel: floors, walls, panoramas, and the camera; a click flies to a panorama.
 
-Panoramas without a known place are squares, those that are only probably placed are rings, floors at approximate places
-are dashed. Other storeys than that of the camera are faint.
+Panoramas without a known place are squares, floors at approximate places are dashed. Other storeys than that of the
+camera are faint.
 """
 
 from __future__ import annotations
@@ -48,26 +48,19 @@ def describe_panorama(tour: TourGraph, node: int) -> str:
     label, placement = tour.panoramas[node].label, tour.panoramas[node].placement
     if not tour.is_placed(node):
         return f"{label} ({'about here' if node in tour.approximate else 'not placed'})"
-    notes = {"probable": " (probably placed)", "by hand": " (placed by hand)"}
-    return label + notes.get(placement.state, "")
+    return f"{label} (placed by hand)" if placement.state == "by hand" else label
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, probable, approximate and no place, and of fades on poor flights."""
+    """The number of panoramas with a known, approximate and no place, and of fades on poor flights."""
     flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
     ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
-    probable = sum(is_probable(tour, node) for node in range(len(tour)))
-    if not alone and not probable:
+    if not alone:
         return f"{describe_count(len(tour), 'panorama')}{ways}"
-    counts = [(len(tour) - alone - probable, "placed"), (probable, "probably"), (len(tour.approximate), "about here")]
-    counts.append((alone - len(tour.approximate), "not placed"))
+    about = len(tour.approximate)
+    counts = (len(tour) - alone, "placed"), (about, "about here"), (alone - about, "not placed")
     return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
-
-
-def is_probable(tour: TourGraph, node: int) -> bool:
-    """Whether a panorama is only probably placed."""
-    return tour.panoramas[node].placement.state == "probable" and tour.is_placed(node)
 
 
 class Minimap:
@@ -138,8 +131,6 @@ class Minimap:
             color = colors[5 if node in others else node in loaded]
             if not tour.is_placed(node):
                 canvas.add_rect_filled((x - half, y - half), (x + half, y + half), color)
-            elif is_probable(tour, node):
-                canvas.add_circle((x, y), 4.0 * scale, color, 0, 1.8 * scale)
             else:
                 canvas.add_circle_filled((x, y), 4.0 * scale, color)
         here = int(np.linalg.norm(tour.positions - np.asarray(camera.position), axis=1).argmin())

@@ -27,7 +27,7 @@ from pansplat_viewer.scene.state import (
     toggle_play,
 )
 from pansplat_viewer.scene.tour import TourScenes
-from pansplat_viewer.ui.minimap import Minimap, describe_panorama, describe_panoramas, is_probable
+from pansplat_viewer.ui.minimap import Minimap, describe_panorama, describe_panoramas
 from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
     FIXED,
@@ -149,8 +149,6 @@ class Panels:
         if state.minimap:
             clicked = self.minimap.draw(tour, state.camera)
             state.target = state.target if clicked is None else clicked
-            if any(is_probable(tour.tour, node) for node in range(len(tour.tour))):
-                imgui.text_disabled("ring: probably placed")
             if tour.tour.approximate:
                 imgui.text_disabled("dashed: about here")
         imgui.set_next_item_width(-1)
