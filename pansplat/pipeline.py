@@ -282,15 +282,12 @@ def choose_refine_steps(views: int, *, joint: bool = False) -> int:
     return max(_JOINT_STEPS, _MIN_STEPS * views) if joint else _REFINE_STEPS
 
 
-def load_photographs(pair: Pair, height: int, gaussians: int | None) -> Views:
-    """The context panoramas for the refinement of a scene of a height, to at most a number of Gaussians.
+def load_photographs(pair: Pair, height: int) -> Views:
+    """The context panoramas for the refinement of a scene of a height: with twice its rows, at most `DISPLAY_HEIGHT`.
 
-    With a limit they have twice the rows, at most `DISPLAY_HEIGHT`: those of the prediction do not show the gaps
-    between Gaussians.
+    Those of the prediction do not show detail, and the gaps between Gaussians, that larger pictures show.
     """
-    if gaussians is not None:
-        height = max(height, min(2 * height, DISPLAY_HEIGHT, pair.image_height))
-    return pair.load_context(height)
+    return pair.load_context(max(height, min(2 * height, DISPLAY_HEIGHT, pair.image_height)))
 
 
 @dataclass(frozen=True)
@@ -431,9 +428,7 @@ def _refine_prediction(task: _Task, on_predicted: Callable[[Scene], None] | None
         on_predicted(scene)
     if final is not None:
         return final
-    photographs = task.views
-    if isinstance(task.source, Pair) and options.gaussians is not None:
-        photographs = load_photographs(task.source, scene.height, options.gaussians)
+    photographs = task.views if isinstance(task.source, Views) else load_photographs(task.source, scene.height)
     config = RefineConfig(gaussians=options.gaussians)
     refined, _ = _refine_scene(scene, photographs, config, steps=options.refine_steps)
     content = CachedScene(refined.gaussians, refined.gains)

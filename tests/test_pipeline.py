@@ -316,15 +316,15 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     assert all(getattr(tiles, name) == getattr(whole, name) for name in ("near", "far", "names", "model", "height"))
 
 
-def test_photographs_for_a_limited_refinement_have_twice_the_rows_if_the_files_do(
+def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(
     tmp_path: Path, write_pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (pair,) = load_pairs(write_pair(tmp_path / "pair", height=64))
-    for height, gaussians, rows in ((16, None, 16), (16, 100, 32), (48, 100, 64), (64, 100, 64)):
-        assert pipeline.load_photographs(pair, height, gaussians).images.shape[-2] == rows
+    for height, rows in ((16, 32), (48, 64), (64, 64)):
+        assert pipeline.load_photographs(pair, height).images.shape[-2] == rows
     monkeypatch.setattr(pipeline, "DISPLAY_HEIGHT", 24)
-    assert pipeline.load_photographs(pair, 16, 100).images.shape[-2] == 24
-    assert pipeline.load_photographs(pair, 48, 100).images.shape[-2] == 48
+    assert pipeline.load_photographs(pair, 16).images.shape[-2] == 24
+    assert pipeline.load_photographs(pair, 48).images.shape[-2] == 48
 
 
 @pytest.mark.slow

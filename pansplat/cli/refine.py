@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Prediction(PredictOptions):
-    """The prediction of a pair. The photographs of a scene file are resized to its height by default."""
+    """The prediction of a pair. The photographs of a scene file have twice its rows by default, at most 1,024."""
 
     refine_steps: Annotated[int, Fixed, Suppress] = 0
 
@@ -107,11 +107,11 @@ class Refine(Computation):
 
         if self.photographs is not None:
             scene = pipeline.load(self.path)
-            views = choose_pair(self.photographs, self.choice).load_context(self.prediction.height or scene.height)
-            return scene, views
+            pair = choose_pair(self.photographs, self.choice)
+            return scene, pipeline.load_photographs(pair, self.prediction.height or scene.height)
         pair = choose_pair(self.path, self.choice)
         scene = predict_scene(pair, self.prediction)
-        return scene, pair.load_context(scene.height)
+        return scene, pipeline.load_photographs(pair, scene.height)
 
 
 def _describe(report: RefineReport, compared: str) -> str:

@@ -45,10 +45,10 @@ from pansplat.rendering.weights import compute_blending_weights
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 
-_HEIGHT = 512  # largest of the images that are compared; colours are fitted at the photographs' own height
-# The same with a limit of Gaussians. These are larger than the pixels, and fitted at 512 rows they show as rows of dots
-# in larger images (docs/refinement.md).
+# Largest height of the images that are compared, at least that of a display: fitted at the rows of the prediction,
+# edges are rows of dots in larger images (docs/refinement.md). Colours are fitted at the photographs' own height.
 DISPLAY_HEIGHT = 1024
+_CONTRIBUTION_HEIGHT = 512  # largest of the images by which Gaussians are merged and dropped
 _HELD_OUT = 0.04  # fraction of the blocks of the photographs
 _SPLIT_ERROR = 0.1  # least sum of a split Gaussian's absolute errors times its blending weights, pixels
 # Decay of Adam's averages of the gradients and of their squares: short ones, since a run has tens of steps. Wrong poses
@@ -148,10 +148,9 @@ class Refinement:
         self._images = views.images.float().to(device)
         self._masks = views.masks.to(device)
         compared = (views.masks & mask_holes(views.images)).to(device)
-        limit = self.config.gaussians
-        height = min(self._images.shape[-2], _HEIGHT if limit is None else DISPLAY_HEIGHT)
+        limit, height = self.config.gaussians, min(self._images.shape[-2], DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
-        self._contribution_size = (min(height, _HEIGHT), 2 * min(height, _HEIGHT))  # of contributions
+        self._contribution_size = (min(height, _CONTRIBUTION_HEIGHT), 2 * min(height, _CONTRIBUTION_HEIGHT))
         if limit is not None and len(scene.gaussians) > limit:
             scene = merge_to(scene, self._contribution_size, limit)
         self._start, poses = scene, scene.cam2world

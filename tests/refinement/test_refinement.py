@@ -227,8 +227,8 @@ def test_a_budget_limits_the_gaussians(room) -> None:
     assert room.error(refined, middle) < room.error(room.predicted, middle)
 
 
-def test_a_limited_scene_is_compared_at_the_rows_of_a_display(room, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pansplat.refinement.refinement._HEIGHT", 8)
+def test_a_scene_is_compared_at_the_rows_of_a_display(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.refinement.refinement._CONTRIBUTION_HEIGHT", 8)
     errors = []
     for rows in (8, 32):
         monkeypatch.setattr("pansplat.refinement.refinement.DISPLAY_HEIGHT", rows)
