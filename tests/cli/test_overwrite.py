@@ -19,7 +19,6 @@ from pansplat.system.files import is_written, require_replaceable
 OWN = b"of the user"
 SPHERE = ["--model", "sphere", "--refine", "0"]
 EXPORT = ["export", *SPHERE, "--predict-height", "64"]
-COARSE = ["--triangles", "4000"]  # of a mesh
 COMMANDS = {
     "scene.ply": ["predict", "{room}", *SPHERE, "--height", "64"],
     "again.ply": ["refine", "{room}", "--model", "sphere", "--height", "64", "--steps", "1"],
@@ -33,7 +32,6 @@ COMMANDS = {
     "points.ply": [*EXPORT, "{room}", "--points"],
     "page.html": [*EXPORT, "{room}"],
     "plan.png": [*EXPORT, "{room}"],
-    "mesh.glb": [*EXPORT, "{room}", "--mesh", *COARSE],
 }
 
 
