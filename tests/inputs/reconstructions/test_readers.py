@@ -66,6 +66,29 @@ def test_nerfstudio_equirectangular_cameras(
         np.testing.assert_allclose(panorama.cam2world, cameras[NAMES.index(panorama.image.name)], atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_points_that_nerfstudio_names_give_near_and_far(
+    tmp_path: Path, cameras: list[Array], points: Array, write_panorama, kind: str
+) -> None:
+    frames = [
+        {"file_path": name, "transform_matrix": opengl(pose).tolist()}
+        for name, pose in zip(NAMES, cameras, strict=True)
+    ]
+    for name, pose in zip(NAMES, cameras, strict=True):
+        write_panorama(tmp_path / name, pose)
+    head = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n"
+    head += "".join(f"property {name}\n" for name in ("double x", "double y", "double z", "uchar red")) + "end_header\n"
+    table = np.zeros(len(points), [("xyz", "<f8", 3), ("red", "u1")])
+    table["xyz"] = points
+    rows = "".join(f"{x} {y} {z} 0\n" for x, y, z in points).encode() if kind == "ascii" else table.tobytes()
+    (tmp_path / "points.ply").write_bytes(head.encode() + rows)
+    write_transforms(tmp_path, frames, camera_model="EQUIRECTANGULAR", ply_file_path="points.ply")
+    distances = np.min([np.linalg.norm(points - pose[:3, 3], axis=1) for pose in cameras], axis=0)
+    pair = load(tmp_path)[0][0]
+    assert pair.near == pytest.approx(np.quantile(distances, 0.01) / 2, rel=0.01)
+    assert pair.far == pytest.approx(np.quantile(distances, 0.99) * 2, rel=0.01)
+
+
 def test_the_transform_and_scale_that_nerfstudio_applied_are_undone(
     tmp_path: Path, cameras: list[Array], write_panorama
 ) -> None:
