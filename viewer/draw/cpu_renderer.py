@@ -38,8 +38,7 @@ from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.system.devices import say_detail
-from pansplat_viewer.draw.color_maps import map_values
-from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
 from pansplat_viewer.draw.splats import Splats, drop_not_finite
@@ -273,13 +272,13 @@ class CpuRenderer:
         splats, settings = self._splats, frame.settings
         layer_weights = choose_layer_weights(frame, splats, _MIN_WEIGHT)
         views = tuple(layer_weights)
-        key = (views, settings.selection)
+        key = (views, settings.levels)
         if key not in self._groups:
             if len(self._groups) >= _MAX_SELECTIONS:
                 self._groups.clear()
             labels = np.full(len(splats), NO_LAYER, np.int16)
             for layer, view in enumerate(views):
-                labels[splats.select(settings.selection, view)] = layer
+                labels[splats.select(settings.levels, view)] = layer
             self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
         labels, visible = self._groups[key]
         return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)
@@ -328,10 +327,7 @@ class CpuRenderer:
         if name == "color":
             return scene
         if self._colored is None or self._colored[0] != name:
-            cameras = splats.view_positions - splats.origin
-            arrays = scene.means, scene.quats, scene.scales, splats.levels, splats.views, cameras
-            colors = color_by_property(name, *arrays)
-            self._colored = name, scene.with_colors(colors)
+            self._colored = name, scene.with_colors(color_by_label(getattr(splats, name)))
         return self._colored[1]
 
     def _read_from_faces(self, frame: Frame, groups: _Groups) -> _Picture:

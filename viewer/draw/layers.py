@@ -182,7 +182,7 @@ class LayerPainter:
         self.rasterizer.release()
 
     def _select(self, settings: DrawSettings, view: int | None) -> Bool[np.ndarray, "n"]:
-        key = (settings.selection, view)
+        key = (settings.levels, view)
         if key not in self._selections:
             if len(self._selections) > _MAX_SELECTIONS:
                 self._selections.clear()

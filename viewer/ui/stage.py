@@ -246,7 +246,7 @@ class Stage:
         turned = not moved and camera != self.last_camera
         self.last_camera = camera
         self.resolution.limit(self.size, self.renderer.pacing.min_size)
-        return self.resolution.plan(self._state.now, moved=moved, turned=turned, adaptive=self._state.adaptive)
+        return self.resolution.plan(self._state.now, moved=moved, turned=turned)
 
     def _record_time(self, plan: ResolutionPlan, milliseconds: float) -> None:
         if milliseconds > 0:  # else the image is not new, or not finished

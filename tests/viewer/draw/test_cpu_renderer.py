@@ -94,7 +94,7 @@ def test_turning_draws_only_missing_faces(renderer, pose, turned):
     moved = pose.copy()
     moved[0, 3] += 0.01
     assert not renderer.has_faces(moved, SIZE, cached), "a new position needs new faces"
-    assert not renderer.has_faces(pose, SIZE, replace(cached, opacity_threshold=0.5))
+    assert not renderer.has_faces(pose, SIZE, replace(cached, levels=frozenset((0,))))
 
 
 def test_without_waiting_the_last_image_is_shown_until_the_new_one_is_finished(renderer, pose, turned, wait_until):
