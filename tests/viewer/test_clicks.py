@@ -34,11 +34,7 @@ from pansplat.tours.graph import find_tours
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
-from pansplat_viewer.scene.loader import (
-    LoadedScene,
-    SceneEntry,
-    SceneLoader,
-)
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import Display, DrawSettings
 from pansplat_viewer.scene.state import ViewerState
@@ -521,10 +517,10 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     user.draw_frames(8)
-    assert user.viewer.stage.image_size[0] < SIZE[0]
+    assert user.viewer.stage.renderer.stats.size[0] < SIZE[0]
     io.add_key_event(imgui.Key.w, False)
     user.settle()
-    assert user.viewer.stage.image_size == SIZE
+    assert user.viewer.stage.renderer.stats.size == SIZE
 
 
 def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):

@@ -86,7 +86,6 @@ class FrameStats:
     """Counts and times of the last frame.
 
     Attributes:
-        visible: Gaussians selected by view, level and opacity threshold; in mode `deferred`, summed over the views.
         drawn: splats sent to the GPU for this frame after culling, summed over faces and views; 0 if all layers
             were cached.
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
@@ -99,12 +98,10 @@ class FrameStats:
     """
 
     total: int = 0  # Gaussians of the scene on the GPU
-    visible: int = 0
     drawn: int = 0
     sort_ms: float = 0.0
     frame_ms: float = 0.0
     timed: DrawSettings | None = None
-    renderer: Literal["gl", "cpu"] = "gl"
     cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)
