@@ -96,10 +96,7 @@ def test_every_format_is_described_drawn_and_opened(
 
 
 def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
-    tmp_path: Path,
-    write_tour: Callable[..., Path],
-    refusal: Callable[..., str],
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, write_tour: Callable[..., Path], refusal: Callable[..., str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     house, out = write_tour(tmp_path / "house", height=64), tmp_path / "tour"
     command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]

@@ -41,8 +41,7 @@ def test_help_does_not_import_torch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "name"),
-    [("cli", "pansplat"), ("viewer", "pansplat-view"), ("training", "pansplat-train")],
+    ("module", "name"), [("cli", "pansplat"), ("viewer", "pansplat-view"), ("training", "pansplat-train")]
 )
 def test_the_version_is_printed_without_torch_by_an_installed_command(module: str, name: str) -> None:
     package = {"cli": "pansplat.cli", "viewer": "pansplat_viewer", "training": "pansplat.training.__main__"}[module]
@@ -200,11 +199,7 @@ def test_equal_notes_are_printed_once_and_warning_filters_are_restored(scene: Pa
         (KeyboardInterrupt(), 130, "interrupted"),
         (MemoryError(), 2, "error: out of memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: ..."), 2, "error: out of memory"),
-        (
-            RuntimeError("a defect"),
-            70,
-            "error: internal error (RuntimeError: a defect), please report it with the log /",
-        ),
+        (RuntimeError("a defect"), 70, "error: internal error (RuntimeError: a defect)"),
     ],
 )
 @pytest.mark.parametrize("debug", ["0", "1"])

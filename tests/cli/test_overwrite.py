@@ -116,7 +116,5 @@ def test_other_files_are_not_taken_for_ours(tmp_path: Path) -> None:
     Image.new("RGB", (8, 4)).save(tmp_path / "p.png")
     assert not any(map(is_written, tmp_path.iterdir())) and not is_written(tmp_path / "missing")
     require_replaceable("--out", [tmp_path / "0.txt", tmp_path / "missing"])
-    with pytest.raises(
-        InputError, match=r"1\.txt, .*2\.txt, .*3\.txt and 1 more, which pansplat did not write; choose"
-    ):
+    with pytest.raises(InputError, match=r"1\.txt, .*2\.txt, .*3\.txt and 1 more"):
         require_replaceable("--out", [tmp_path / f"{number}.txt" for number in range(5)])

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy
 import torch
 from synthetic_scenes import make_balls
 

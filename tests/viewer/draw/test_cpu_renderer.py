@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.rendering.cpu.display import MIN_TRANSMITTANCE
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer, choose_renderer, create_renderer
 from pansplat_viewer.scene.settings import DrawSettings
@@ -127,8 +127,7 @@ def test_software_opengl_is_replaced_by_the_processor_unless_chosen(ctx):
     software = SimpleNamespace(info={"GL_RENDERER": "llvmpipe (LLVM 15.0.6, 256 bits)"})
     assert [choose_renderer(each, "auto") for each in (gpu, software, None)] == ["gl", "cpu", "cpu"]
     assert choose_renderer(software, "gl") == "gl" and choose_renderer(gpu, "cpu") == "cpu"
-    with pytest.raises(InputError, match="needs an OpenGL context; use `cpu`"):
-        create_renderer(None, "gl")
+    expect_error("needs an OpenGL context; use `cpu`", create_renderer, None, "gl")
 
 
 def test_errors_in_the_worker_are_raised_and_drawing_goes_on(renderer, pose, monkeypatch):

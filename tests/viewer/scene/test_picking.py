@@ -44,10 +44,7 @@ def test_depth_is_the_mean_by_weight(scene):
     assert point.position == pytest.approx((0, 0, point.depth))
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [DrawSettings(levels=frozenset((0,))), DrawSettings(mode="view", view=0)],
-)
+@pytest.mark.parametrize("settings", [DrawSettings(levels=frozenset((0,))), DrawSettings(mode="view", view=0)])
 def test_hidden_gaussians_are_not_picked(scene, settings):
     assert pick_point(scene, np.zeros(3), np.array((0.0, 0.0, 1.0)), settings).depth == pytest.approx(2)
 
