@@ -495,8 +495,7 @@ class TourGraph:
     @cached_property
     def _shortest(self) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
         """Cost of the cheapest way between all nodes, and the node before its end."""
-        options = {"method": "FW", "directed": False, "return_predecessors": True}
-        find_ways = partial(scipy.sparse.csgraph.shortest_path, **options)
+        find_ways = partial(scipy.sparse.csgraph.shortest_path, method="FW", directed=False, return_predecessors=True)
         costs = np.full((len(self), len(self)), np.inf)
         for (a, b), overlap in self.overlaps.items():
             # With little overlap a way around looks better.
