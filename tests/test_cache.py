@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.pipeline import load_pairs, predict
@@ -159,14 +159,12 @@ def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predi
 
 @pytest.mark.parametrize("steps", [-1, 2.5, float("nan"), True])
 def test_an_invalid_number_of_steps_of_the_refinement_is_refused(pair_folder: Path, sphere_predictor, steps) -> None:
-    with pytest.raises(InputError, match="`refine_steps` must be a whole number of at least 0"):
-        predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_steps=steps)
+    expect_error("`refine_steps`", lambda: predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_steps=steps))
 
 
 def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_folder: Path, sphere_predictor) -> None:
     predictor = sphere_predictor()
-    with pytest.raises(InputError, match="`gaussians` must be at least 1"):
-        predict(pair_folder, predictor, height=HEIGHT, refine_steps=8, gaussians=0)
+    expect_error("`gaussians`", predict, pair_folder, predictor, height=HEIGHT, refine_steps=8, gaussians=0)
     assert predictor.calls == 0
 
 

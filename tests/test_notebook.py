@@ -15,6 +15,7 @@ import pytest
 import torch
 from IPython.core.formatters import DisplayFormatter
 from PIL import Image
+from refusals import expect_error
 from synthetic_scenes import make_balls, place_cameras
 from torch import Tensor
 
@@ -112,10 +113,8 @@ def test_show_writes_a_page_and_opens_it(scene: Scene, monkeypatch: pytest.Monke
 
 
 def test_show_refuses_a_scene_without_gaussians(scene: Scene) -> None:
-    with pytest.raises(InputError, match="no visible Gaussians"):
-        pansplat.show(dataclasses.replace(scene, gaussians=empty_gaussians()))
-    with pytest.raises(InputError, match="at least 1, got 0"):
-        pansplat.show(scene, gaussians=0)
+    expect_error("no visible Gaussians", lambda: pansplat.show(dataclasses.replace(scene, gaussians=empty_gaussians())))
+    expect_error("at least 1, got 0", pansplat.show, scene, gaussians=0)
 
 
 class Output:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.gaussians import formats
 from pansplat.inputs.folders import load_pairs
 from pansplat.model.weights import load_weights, pack_weights, save_weights
@@ -55,8 +55,7 @@ def test_a_picture_that_poses_name_in_other_capitals_is_one_picture(pair_folder:
 
 def test_a_drive_that_does_not_exist_ends_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os.path, "lexists", lambda _: False)
-    with pytest.raises(InputError, match="needed an existing drive"):
-        require_output_folder("--out", Path("/nowhere/at/all"))
+    expect_error("needed an existing drive", lambda: require_output_folder("--out", Path("/nowhere/at/all")))
     monkeypatch.setattr(os, "access", lambda *_: False)
     environment = {"XDG_CACHE_HOME": "/nowhere"}
     choose_kernel_cache("/nowhere", environment)

@@ -63,7 +63,6 @@ class Viewer:
         panels: the panels, with the rectangles of their widgets.
         recent: the paths that were opened, the last one first.
         error: message of the last failure.
-        frame_ms: time of a whole frame, smoothed.
     """
 
     def __init__(
@@ -96,7 +95,6 @@ class Viewer:
         """
         self._ctx, self.state = ctx, state or ViewerState()
         self.error: str | None = None
-        self.frame_ms = 0.0
         self._clock = clock
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
         self.scenes = Scenes(
@@ -165,7 +163,7 @@ class Viewer:
 
         `new_frame` passes the window's size and pointer to imgui; without it the caller has set imgui's io.
         """
-        start, state, stage = time.perf_counter(), self.state, self.stage
+        state, stage = self.state, self.stage
         _, _, width, height = target.viewport
         state.now, stage.size = self._clock(), (width, height)
         self.scenes.poll()
@@ -196,8 +194,6 @@ class Viewer:
         actions, self._queue = self._queue, []
         for action in actions:
             action()
-        milliseconds = 1000 * (time.perf_counter() - start)
-        self.frame_ms += (milliseconds - self.frame_ms) * (0.15 if self.frame_ms else 1.0)
 
     def close(self) -> None:
         """Stop the threads and free every GL object; the context must still be current."""

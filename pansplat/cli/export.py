@@ -1,4 +1,4 @@
-"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, mesh, plan or training set.
+"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, plan or training set.
 
 Each kind of file is a dataclass of the options that only it has.
 """
@@ -32,13 +32,10 @@ from pansplat.system.options import Count, Real
 from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair
 
 _INDEX = "index.html"  # of a folder
-_TEXTURE_HEIGHT = 2048  # pixels of the photographs on a mesh, at most
 _FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
 _MOST_GAUSSIANS = 2_000_000  # of a page in one file
 _BYTES = 22  # of a Gaussian in a page
@@ -82,66 +79,6 @@ class _FloorPlan:
 
         scene, _ = export.open()
         print(f"{export.out}: {'; '.join(describe_plan(write_plan(scene, export.out)))}")
-
-
-@dataclass(frozen=True)
-class _Mesh:
-    """For a mesh."""
-
-    suffixes: ClassVar = ()
-    files: ClassVar = "a mesh (a .glb with --mesh)"
-
-    mesh: bool = False
-    """Write a .glb of triangles with the photographs as textures."""
-    triangles: Count | None = None
-    """Largest number of triangles, 2,000,000 by default."""
-    whole: bool = False
-    """Keep what is outside of the rooms of the floor plan, such as what windows and mirrors show."""
-
-    def write(self, export: Export) -> None:
-        """Write triangles with textures: of the photographs, or for a scene file of its Gaussians."""
-        from pansplat.export.mesh import DEFAULT_TRIANGLES, make_mesh
-        from pansplat.export.mesh_files import remove_old_meshes, save_mesh
-        from pansplat.images.blur_masks import fill_hidden
-        from pansplat.tours.doll_house import find_rooms
-        from pansplat.tours.facts import TourFacts
-        from pansplat.tours.graph import make_graph, select_views
-
-        scene, photographs = export.open()
-
-        def load(view: int) -> Tensor:
-            views = photographs[view].load_context(min(photographs[view].image_height, _TEXTURE_HEIGHT))
-            return fill_hidden(views.images[0], views.masks[0])
-
-        places = sorted(make_graph(scene).list_parts(), key=len, reverse=True) if scene.overlaps else []
-        meshes = {}
-        for number, views in enumerate(places or [list(range(len(scene.cam2world)))], 1):
-            part = select_views(scene, views) if len(places) > 1 else scene
-            inside = None if self.whole or not views else find_rooms(TourFacts(part)).contains
-            limit = (self.triangles or DEFAULT_TRIANGLES) * len(views) // max(len(scene.cam2world), 1)
-            textures = (lambda view, views=views: load(views[view])) if photographs else None
-            mesh = make_mesh(part, triangles=limit, textures=textures, inside=inside)
-            name = export.out.name if number == 1 else f"{export.out.stem}_{number}{export.out.suffix}"
-            if mesh.parts:
-                meshes[export.out.with_name(name)] = dataclasses.replace(
-                    mesh, part_of=export.out.name if number > 1 else ""
-                )
-        if not meshes:
-            raise InputError(f"{export.path}: needed surfaces in rooms, got none; --whole keeps all of them")
-        require_replaceable("--out", meshes, export.overwrite)
-        for file, mesh in meshes.items():
-            save_mesh(mesh, file)
-            count, names = len(mesh.parts), ", ".join(part.name for part in mesh.parts)
-            whose = names if file != export.out else describe_count(count, "panorama")
-            print(f"{file}: {mesh.num_triangles:,} triangles of {whose}, {file.stat().st_size / 1e6:.1f} MB")
-        remove_old_meshes(export.out, meshes)
-        if len(meshes) > 1:
-            print(
-                f"note: {export.out}: what is not placed relative to each other is in {len(meshes)} files",
-                file=sys.stderr,
-            )
-        if not self.whole and len(scene.cam2world):
-            print(f"note: {export.out}: without what is outside of the rooms; --whole keeps it", file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -321,8 +258,8 @@ class _Photographs:
 class Export(Computation):
     """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
     web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
-    with straight walls and areas (.svg, .png), as textured triangles (.glb with --mesh), or as a folder
-    to train further from (--training-set): cube faces, poses and points for COLMAP, nerfstudio, gsplat and brush."""
+    with straight walls and areas (.svg, .png), or as a folder to train further from (--training-set): cube faces, poses
+    and points for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
@@ -344,14 +281,13 @@ class Export(Computation):
     scene: _SceneFile = field(default_factory=_SceneFile)
     page: Page = field(default_factory=Page)
     plan: _FloorPlan = field(default_factory=_FloorPlan)
-    mesh: _Mesh = field(default_factory=_Mesh)
     training: _TrainingSet = field(default_factory=_TrainingSet)
     panoramas: _Photographs = field(default_factory=_Photographs)
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
 
     def run(self) -> int:
         """Write the file and print its size."""
-        kinds = self.scene, self.page, self.plan, self.mesh, self.training, self.panoramas
+        kinds = self.scene, self.page, self.plan, self.training, self.panoramas
         table = {suffix: kind for kind in kinds for suffix in kind.suffixes}
         suffix = self.out.suffix.lower()
         if self.training.training_set or self.panoramas.photos:
@@ -359,7 +295,7 @@ class Export(Computation):
         else:
             if suffix:
                 require_output_file("--out", self.out, tuple(filter(None, table)), overwrite=self.overwrite)
-            kind = self.mesh if self.mesh.mesh and suffix == ".glb" else table[suffix]
+            kind = table[suffix]
         for other in kinds:
             for option in dataclasses.fields(other):
                 if other is not kind and getattr(other, option.name) != option.default:

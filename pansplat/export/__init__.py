@@ -1,1 +1,1 @@
-"""Files made of scenes and tours: web pages, floor plans, meshes, training sets, and the clean-up before."""
+"""Files made of scenes and tours: web pages, floor plans, training sets, and the clean-up before."""

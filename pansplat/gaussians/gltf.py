@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,35 +63,20 @@ def save_glb(scene: Scene, path: Path) -> None:
         raise InputError(f"cannot write {path}: the format holds 1 or more Gaussians, got none; write a .ply")
     attributes = _list_attributes(gaussians)
     entry = format_entry(scene, find_label_runs(gaussians))
-    blocks = [np.ascontiguousarray(values).data for values in attributes.values()]
-    content = f"{len(gaussians):,} Gaussians of degree {gaussians.degree}"
-    write_glb(_describe(attributes, entry), blocks, path, content, "write a .ply, or reduce --degree")
-
-
-def write_glb(
-    document: dict[str, Any], blocks: Sequence[memoryview | bytes], path: Path, content: str, advice: str
-) -> None:
-    """Write the container of a .glb, atomically.
-
-    Args:
-        document: the JSON document.
-        blocks: of the buffer, in order; each takes a multiple of 4 bytes.
-        path: the file.
-        content, advice: what it holds, and what to do if that is too much, for the message.
-    """
-    text = json.dumps(document, separators=(",", ":")).encode()
+    text = json.dumps(_describe(attributes, entry), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    size = sum(memoryview(block).nbytes for block in blocks)
+    size = sum(values.nbytes for values in attributes.values())
     total = 12 + 8 + len(text) + 8 + size
     if total > _MAX_BYTES:
         raise InputError(
-            f"cannot write {path}: the format holds {_MAX_BYTES:,} bytes, {content} need {total:,}; {advice}"
+            f"cannot write {path}: the format holds {_MAX_BYTES:,} bytes, {len(gaussians):,} Gaussians of degree "
+            f"{gaussians.degree} need {total:,}; write a .ply, or reduce --degree"
         )
     with replacing(path) as partial, open(partial, "wb") as file:
         file.write(struct.pack("<4sIIII", _MAGIC, _VERSION, total, len(text), _JSON) + text)
         file.write(struct.pack("<II", size, _BINARY))
-        for block in blocks:
-            file.write(block)
+        for values in attributes.values():
+            file.write(values.data)
 
 
 def _list_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:

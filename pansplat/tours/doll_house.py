@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from shapely.geometry import Polygon
 
 from pansplat.tours.facts import TourFacts
@@ -18,10 +18,8 @@ from pansplat.tours.surfaces import sample_surfaces
 
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
 _WALL = 0.15  # how far behind the outline of a room its walls are, in heights of the camera
-_BEYOND = 0.4  # the same around a floor without walls, where furniture may stand
 _BROAD = 0.12, 0.88  # of its ends, at equal steps of azimuth: a floor goes on behind doors and windows
 _LEAST_AREA = 0.4  # of a floor that is a room, squared camera heights
-_SHOWN = 0.9  # of the surfaces of a view without walls and floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,6 @@ class Rooms:
         level: right, down and forward (columns) of a level camera.
         positions: of the cameras of all views.
         floors, ceilings: their distances below and above the camera of each view, metres.
-        shape: the rooms from above, with their walls, in plan coordinates.
         outlines: views and outline, anticlockwise, of each room: those of the plan, then floors without walls.
         houses: the views of each storey of a world, if at least half of its rooms are on the plan.
         plan: the floor plan.
@@ -42,22 +39,13 @@ class Rooms:
     positions: Float[np.ndarray, "view 3"]
     floors: Float[np.ndarray, "view"]
     ceilings: Float[np.ndarray, "view"]
-    shape: shapely.Geometry
     outlines: tuple[tuple[tuple[int, ...], Polygon], ...]
     houses: tuple[tuple[int, ...], ...]
     plan: Plan
 
-    def contains(self, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Whether places in the world are in the rooms, from above, with their walls."""
-        plan = np.asarray(places, np.float64) @ self.level[:, (0, 2)]
-        return shapely.contains_xy(self.shape, plan[:, 0], plan[:, 1])
-
 
 def find_rooms(facts: TourFacts) -> Rooms:
-    """The rooms of a scene of all panoramas: those of the floor plan, and the floors of panoramas without walls.
-
-    Where a view shows neither, most of its surfaces are.
-    """
+    """The rooms of a scene of all panoramas: those of the floor plan, and the floors of panoramas without walls."""
     tour, scene, plan, gaussians = facts.tour, facts.scene, facts.plan, facts.scene.gaussians.to(device="cpu")
     level, count = tour.level_axes, len(tour)
     gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
@@ -65,16 +53,11 @@ def find_rooms(facts: TourFacts) -> Rooms:
     unit = choose_camera_height(facts.heights, scene.far)
     ceilings = [find_ceiling(sample_surfaces(scene, view, level)) for view in range(count)]
     outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
-    shapes = [outline.buffer(_WALL * unit, join_style="mitre") for _, outline in outlines]
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
     enclosed = {view for views, _ in outlines for view in views}
     for view in set(range(count)) - enclosed:
         floor = facts.outlines.get(view)
-        if floor is not None:
-            ground = shapely.make_valid(Polygon(floor.corners))
-            shapes.append(ground.buffer(_BEYOND * unit))
-            if not outlines:
-                continue
+        if floor is not None and outlines:
             sides = np.concatenate([np.diff(shapely.get_coordinates(outline), axis=0) for _, outline in outlines])
             x, y = max(sides, key=np.linalg.norm) / np.linalg.norm(sides, axis=1).max()
             axes = np.array(((x, -y), (y, x)))
@@ -85,9 +68,6 @@ def find_rooms(facts: TourFacts) -> Rooms:
             piece = max(shapely.get_parts(free), key=lambda piece: piece.area, default=None)
             if isinstance(piece, Polygon) and piece.area > _LEAST_AREA * unit**2:
                 outlines.append(((view,), shapely.orient_polygons(piece)))
-        elif len(places := sample_surfaces(scene, view, level)):
-            reach = float(np.quantile(np.hypot(places[:, 0], places[:, 2]), _SHOWN))
-            shapes.append(shapely.Point(tour.positions[view] @ level[:, (0, 2)]).buffer(reach))
     houses = []
     for key in dict.fromkeys(keys):
         views = tuple(view for view, other in enumerate(keys) if other == key)
@@ -99,7 +79,6 @@ def find_rooms(facts: TourFacts) -> Rooms:
         tour.positions,
         np.array([height or unit for height in facts.heights]),
         np.array([ceiling or _USUAL_CEILING * unit for ceiling in ceilings]),
-        shapely.union_all(shapes),
         tuple(outlines),
         tuple(houses),
         plan,

@@ -7,11 +7,12 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -494,12 +495,13 @@ class TourGraph:
     @cached_property
     def _shortest(self) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
         """Cost of the cheapest way between all nodes, and the node before its end."""
+        find_ways = partial(scipy.sparse.csgraph.shortest_path, method="FW", directed=False, return_predecessors=True)
         costs = np.full((len(self), len(self)), np.inf)
         for (a, b), overlap in self.overlaps.items():
             # With little overlap a way around looks better.
             doubt = 1.0 if (a, b) in self.poor else max(1 - overlap / 0.25, 0.0)
             costs[a, b] = costs[b, a] = max(self.length((a, b)), 1e-3) * (1 + 3 * doubt)
-        ways, previous = _find_shortest_ways(costs)
+        ways, previous = find_ways(costs)
         is_near = np.isfinite(ways)
         if not is_near.all():
             # Two fades cost more than each way within a part, so that a way between nodes of a part stays in it.
@@ -509,27 +511,13 @@ class TourGraph:
             for a, b in (*self.links, *self.walls):
                 if self.parts[a] != self.parts[b]:
                     costs[a, b] = costs[b, a] = fade
-            ways, previous = _find_shortest_ways(costs)
+            ways, previous = find_ways(costs)
         return ways, previous
 
 
 def _turn_plan(yaw: float) -> Float[np.ndarray, "2 2"]:
     """The rotation to the right of rows (right, forward), which is applied from the right."""
     return np.array(((math.cos(yaw), -math.sin(yaw)), (math.sin(yaw), math.cos(yaw))))
-
-
-def _find_shortest_ways(
-    costs: Float[np.ndarray, "node node"],
-) -> tuple[Float[np.ndarray, "node node"], Int[np.ndarray, "node node"]]:
-    """Cost of the cheapest way between all nodes, and the node before its end, of symmetric costs (Floyd, Warshall)."""
-    ways, previous = costs.copy(), np.repeat(np.arange(len(costs))[:, None], len(costs), axis=1)
-    np.fill_diagonal(ways, 0.0)
-    for middle in range(len(costs)):
-        through = ways[:, middle, None] + ways[middle]
-        is_cheaper = through < ways
-        ways[is_cheaper] = through[is_cheaper]
-        previous = np.where(is_cheaper, previous[middle], previous)
-    return ways, previous
 
 
 def _order_by_distance(costs: Float[np.ndarray, "node node"], start: int) -> Int[np.ndarray, "node"]:

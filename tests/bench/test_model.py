@@ -7,11 +7,7 @@ from pathlib import Path
 import pytest
 
 from pansplat.bench import model as bench_model
-from pansplat.bench.model import (
-    STAGES,
-    ModelCase,
-    save_random_weights,
-)
+from pansplat.bench.model import STAGES, ModelCase, save_random_weights
 from pansplat.cli import run
 from pansplat.model.network import has_bfloat16
 from pansplat.training.network import network_config

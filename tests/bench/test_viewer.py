@@ -4,11 +4,11 @@ import json
 import os
 
 import pytest
+from refusals import expect_error
 
 from pansplat.bench import viewer
 from pansplat.bench.viewer import list_viewer_cases, measure_viewer
 from pansplat.cli import run
-from pansplat.errors import InputError
 
 CASES = [case for case in list_viewer_cases((64, 48)) if case.view == "perspective"]
 
@@ -29,8 +29,6 @@ def test_the_viewer_renders_the_exact_images_and_the_command_writes_rows_page_an
     assert "| cpu |" in (tmp_path / "viewer.md").read_text()
     assert (tmp_path / "viewer.png").stat().st_size > 5000
     (tmp_path / "job.json").write_text("{}")
-    with pytest.raises(InputError, match="the viewer rendered nothing: error: 'scene'"):
-        viewer.run_viewer(tmp_path / "job.json", 1)
+    expect_error("the viewer rendered nothing: error: 'scene'", viewer.run_viewer, tmp_path / "job.json", 1)
     monkeypatch.setattr(viewer, "_VIEWER_PACKAGE", "no_such_package")
-    with pytest.raises(InputError, match="viewer is not installed"):
-        list(measure_viewer(16, CASES, repeats=1, threads=1))
+    expect_error("viewer is not installed", lambda: list(measure_viewer(16, CASES, repeats=1, threads=1)))

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -76,30 +75,6 @@ def test_all_commands_and_the_viewer_take_weights(tmp_path: Path, write_room, sm
     (entry,) = (entry for entry in find_entries(room, ReadOptions(), options) if entry.pair is not None)
     viewed = load_entry(entry, options).scene
     assert torch.equal(viewed.gaussians.means, scenes["fixed"].gaussians.means)
-
-
-def test_a_mismatched_checkpoint_is_refused(
-    content: dict[str, object], tmp_path: Path, refusal: Callable[..., str]
-) -> None:
-    state = dict(content["state_dict"])  # type: ignore[call-overload]
-    del state["encoder.backbone.encoder.conv00.conv.weight"]
-    state["encoder.extra"] = torch.zeros(1)
-    torch.save(content | {"state_dict": state}, tmp_path / "odd.ckpt")
-    message = refusal("convert", tmp_path / "odd.ckpt", "-o", tmp_path / "m.safetensors")
-    assert "lacked 1 (encoder.backbone.encoder.conv00.conv.weight) and found unknown 1 (encoder.extra)" in message
-    assert not (tmp_path / "m.safetensors").exists()
-
-
-def test_code_in_a_checkpoint_is_not_executed(tmp_path: Path, refusal) -> None:
-    mark = tmp_path / "was run"
-
-    class Poison:
-        def __reduce__(self) -> tuple[object, ...]:
-            return os.mkdir, (str(mark),)
-
-    torch.save({"state_dict": {}, "callbacks": Poison()}, tmp_path / "poisoned.ckpt")
-    assert "was not executed" in refusal("convert", tmp_path / "poisoned.ckpt", "-o", tmp_path / "m.safetensors")
-    assert not mark.exists() and not (tmp_path / "m.safetensors").exists()
 
 
 def test_a_truncated_checkpoint_is_refused(conversion: tuple[Path, Path, str], tmp_path: Path, refusal) -> None:

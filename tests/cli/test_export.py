@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 from PIL import Image
 from synthetic_scenes import make_balls, place_cameras, see_box
 
@@ -97,10 +96,7 @@ def test_every_format_is_described_drawn_and_opened(
 
 
 def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
-    tmp_path: Path,
-    write_tour: Callable[..., Path],
-    refusal: Callable[..., str],
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, write_tour: Callable[..., Path], refusal: Callable[..., str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     house, out = write_tour(tmp_path / "house", height=64), tmp_path / "tour"
     command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
@@ -181,32 +177,6 @@ def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     assert '"groups": [[0]]' in (tmp_path / "photo.html").read_text()
 
 
-def test_the_mesh_of_a_panorama_without_a_pose_is_a_file_of_its_own(
-    tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
-    alone = dataclasses.replace(second.context[1], world=1, title="Attic")
-    pairs = [dataclasses.replace(second, context=(alone,)), first]
-    monkeypatch.setattr(pipeline, "load_pairs", lambda *args, **options: pairs)
-    command = ["export", str(tmp_path / "house"), "--model", "sphere", "--refine", "0", "--predict-height", "64"]
-    command += ["--mesh", "--whole", "--triangles", "6000", "-o", str(tmp_path / "home.glb")]
-    (tmp_path / "home_2.glb").write_text("mine")
-    assert run(command) == 2 and not (tmp_path / "home.glb").exists(), "nothing is written beside a user's file"
-    (tmp_path / "home_2.glb").unlink()
-    assert run(command) == 0
-    printed = capsys.readouterr()
-    assert "triangles of 2 panoramas" in printed.out and "triangles of Attic" in printed.out
-    assert "is in 2 files" in printed.err
-    names = "home.glb", "home_2.glb"
-    placed, (single,) = (list(trimesh.load(tmp_path / n, process=False).geometry.values()) for n in names)
-    photograph = np.asarray(Image.open(alone.image).convert("RGB"), float)
-    assert len(placed) == 2 and sum(len(part.faces) for part in placed) <= 4000 and len(single.faces) <= 2000
-    texture = np.asarray(single.visual.material.baseColorTexture, float)
-    assert np.abs(texture - photograph).mean() < 60, "random pixels, as JPEG; another photograph differs by 85"
-    pairs.remove(pairs[0])
-    assert run(command) == 0 and not (tmp_path / "home_2.glb").exists(), "a mesh of before"
-
-
 def test_a_plan_states_rooms_and_uncertainty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A room of 4 x 6 x 2.6 m."""
     low, high, here = torch.tensor((-2.0, -2.6, -3.0)), torch.tensor((2.0, 0.0, 3.0)), (0.3, -1.5, 0.2)
@@ -218,28 +188,6 @@ def test_a_plan_states_rooms_and_uncertainty(tmp_path: Path, capsys: pytest.Capt
     assert "plan.svg: 1 room, 24.0 m² between the walls; scale: cameras 1.50 m over the floor" in printed
     assert "walls: of one panorama each" in printed
     assert ">Kitchen</text>" in (tmp_path / "plan.svg").read_text()
-
-
-def test_a_mesh_has_the_photographs_and_that_of_a_crop_the_one_of_the_camera_that_is_left(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refusal: Callable[..., str]
-) -> None:
-    command = ["export", str(room), "--model", "sphere", "--refine", "0", "--predict-height", "64", "--mesh"]
-    out, box = tmp_path / "mesh.glb", ["--crop", "0.5", "-9", "-9", "9", "9", "9"]
-    photographs = [np.asarray(Image.open(room / file).convert("RGB"), float) for file in ("a.png", "b.png")]
-    for options, shown in (([], [0, 1]), (box, [1])):
-        assert run([*command, *options, "--triangles", "5000", "-o", str(out)]) == 0
-        count = int(re.findall(r"([\d,]+) triangles", capsys.readouterr().out)[0].replace(",", ""))
-        parts = list(trimesh.load(out, process=False).geometry.values())
-        assert 1000 < count == sum(len(part.faces) for part in parts) <= 5000
-        textures = [np.asarray(part.visual.material.baseColorTexture.convert("RGB"), float) for part in parts]
-        errors = [[np.abs(texture - photograph).mean() for photograph in photographs] for texture in textures]
-        assert sorted(int(np.argmin(row)) for row in errors) == shown
-        assert max(map(min, errors)) < 60, "random pixels, as JPEG; another photograph differs by 85"
-    scene = pipeline.predict(pipeline.load_pairs(room)[0], "sphere", height=64)
-    pipeline.save(dataclasses.replace(scene, cam2world=scene.cam2world[:0], names=()), tmp_path / "foreign.splat")
-    assert "a mesh needs a scene with input cameras" in refusal(
-        "export", tmp_path / "foreign.splat", "-o", out, "--mesh"
-    )
 
 
 def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

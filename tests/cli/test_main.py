@@ -41,8 +41,7 @@ def test_help_does_not_import_torch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "name"),
-    [("cli", "pansplat"), ("viewer", "pansplat-view"), ("training", "pansplat-train")],
+    ("module", "name"), [("cli", "pansplat"), ("viewer", "pansplat-view"), ("training", "pansplat-train")]
 )
 def test_the_version_is_printed_without_torch_by_an_installed_command(module: str, name: str) -> None:
     package = {"cli": "pansplat.cli", "viewer": "pansplat_viewer", "training": "pansplat.training.__main__"}[module]
@@ -148,9 +147,6 @@ REFUSED = {
     "export scene.ply -o x.spz --points": "--points is for a .ply",
     "export scene.ply -o x.png --points": "--points is for a .ply",
     "export room -o x --training-set --points": "--points is for a .ply",
-    "export scene.ply -o x.ply --mesh": "--mesh is for a mesh (a .glb with --mesh)",
-    "export scene.ply -o x.glb --triangles 9": "--triangles is for a mesh",
-    "export scene.ply -o x.glb --mesh --triangles 9": "needs 512 triangles or more",
     "export scene.ply -o x.ply --crop a 0 0 1 1 1": "--crop",
     "export scene.ply -o x.ply --layers --crop 50 50 50 60 60 60": "scene.ply: needed a box with Gaussians, got (50.00",
     "export scene.ply -o x.png": "needed a floor, and walls around at least one of 2 input cameras",
@@ -203,11 +199,7 @@ def test_equal_notes_are_printed_once_and_warning_filters_are_restored(scene: Pa
         (KeyboardInterrupt(), 130, "interrupted"),
         (MemoryError(), 2, "error: out of memory"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: ..."), 2, "error: out of memory"),
-        (
-            RuntimeError("a defect"),
-            70,
-            "error: internal error (RuntimeError: a defect), please report it with the log /",
-        ),
+        (RuntimeError("a defect"), 70, "error: internal error (RuntimeError: a defect)"),
     ],
 )
 @pytest.mark.parametrize("debug", ["0", "1"])

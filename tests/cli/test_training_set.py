@@ -73,10 +73,9 @@ def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
     assert find_panorama_folders(tmp_path) == [tmp_path / "set"]
 
 
-def test_no_export_or_picture_is_a_panorama_of_the_folder(room: Path, scene: Path) -> None:
+def test_no_picture_is_a_panorama_of_the_folder(room: Path, scene: Path) -> None:
     for file in ("poses.json", "pairs.json"):
         (room / file).unlink()
-    assert run(["export", str(scene), "--mesh", "-o", str(room / "house.glb")]) == 0
     for name in ("view.png", "view.jpg", "view.webp"):
         assert run(["render", str(scene), "-o", str(room / name), "--height", "16"]) == 0
     with pytest.warns(InputWarning, match="rendered by pansplat"):

@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 
 import pytest
+from refusals import expect_error
 from rich.console import Console
 
-from pansplat.errors import InputError
 from pansplat.evaluation.results import Column, Row, average_rows, markdown_table, rich_table, write_json
 
 COLUMNS = (Column("method", "method"), Column("PSNR", "psnr", ".2f"), Column("SSIM", "ssim", ".3f"))
@@ -49,5 +49,4 @@ def test_numbers_that_json_has_not_are_null_and_a_failed_write_leaves_the_old_fi
     with pytest.raises(TypeError):
         write_json({"value": object()}, file)
     assert "sort" in file.read_text() and list(tmp_path.iterdir()) == [file]
-    with pytest.raises(InputError, match="create it first"):
-        write_json({}, tmp_path / "no" / "rows.json")
+    expect_error("create it first", write_json, {}, tmp_path / "no" / "rows.json")

@@ -46,7 +46,7 @@ def rooms(scene: Scene) -> Rooms:
     plan = Plan(make_graph(scene), (), (DOOR,), FLOOR, None, None, 3, 0)
     heights = np.full(3, FLOOR), np.full(3, -CEILING)
     outlines = ((0, 1), BOXES[0]), ((2,), BOXES[1])
-    return Rooms(np.eye(3), np.array(CAMERAS), *heights, shapely.union_all(BOXES), outlines, ((0, 1, 2),), plan)
+    return Rooms(np.eye(3), np.array(CAMERAS), *heights, outlines, ((0, 1, 2),), plan)
 
 
 def _color(places: np.ndarray) -> np.ndarray:

@@ -100,7 +100,6 @@ SCENES = [
     Fault("comment: nested 100,000 deep", INFO, comment(_DEEP), "comment is damaged", 0),
     Fault("header: 10^18 vertices", INFO, header(b"vertex 12", b"vertex 1" + b"0" * 18), "truncated"),
     Fault("header: 5000 digits of vertices", INFO, header(b"vertex 12", b"vertex 1" + b"0" * 5000), "header line"),
-    Fault("header: one vertex too many", INFO, header(b"vertex 12", b"vertex 13"), "truncated"),
     Fault("header: vertices without properties", INFO, header(b"property float x\n", b"element face 10000000000000\nproperty float x\n"), "vertices lack"),
     Fault("header: a huge element before the vertices", INFO, header(b"element vertex", b"element face 99999999999999999999\nproperty int a\nelement vertex"), "truncated"),
     Fault("header: a property without a name", INFO, header(b"property float x\n", b"property\n"), "header line"),
@@ -109,11 +108,8 @@ SCENES = [
     Fault("file: cut in the vertices", INFO, content(lambda data: data[:-5]), "truncated"),
     Fault("file: cut in the header, viewed", "pansplat-view scene.ply --offscreen out", content(lambda data: data[:100]), "scene.ply"),
     Fault("vertices: -3e38, as a page", "export scene.ply -o tour.html", vertices(-3e38), "no visible Gaussians"),
-    Fault("vertices: 80, as a page", "export scene.ply -o tour.html", vertices(80.0), "no visible Gaussians"),
-    Fault("a page in a folder that is missing", "export scene.ply -o missing/tour.html", says="existing folder"),
     Fault("a page over a file named like its folder", "export scene.ply -o tour", lambda folder: ((folder / "tour").mkdir(), (folder / "tour/index_files").write_text("")), "index_files"),
     Fault("vertices: -3e38, drawn", DRAW, vertices(-3e38), "", 0),
-    Fault("vertices: 80, drawn", DRAW, vertices(80.0), "", 0),
 ]  # fmt: skip
 
 
@@ -246,9 +242,7 @@ CHECKPOINTS = [
     *(Fault(f"settings: {value[:12]}", WEIGHTS, settings(value), "weights.safetensors: config") for value in (_DEEP, "[]", "5", "null", "{", '"a"', "{}")),
     Fault("metadata: an unknown network", WEIGHTS, settings(lambda c: None, model="gan"), "'gan'"),
     Fault("metadata: a depth network with other settings", WEIGHTS, settings(lambda c: None, model="depth"), "config"),
-    Fault("float16 works", WEIGHTS, cast(torch.float16), status=0),
     Fault("bfloat16 works", WEIGHTS, cast(torch.bfloat16), status=0),
-    Fault("float64 works", WEIGHTS, cast(torch.float64), status=0),
     Fault("integers instead of numbers", WEIGHTS, first(lambda t: t.to(torch.int8)), "int8"),
     Fault("complex numbers", WEIGHTS, first(lambda t: t.to(torch.complex64)), "weights.safetensors"),
     Fault("NaN in a tensor", WEIGHTS, first(lambda t: t * float("nan")), "NaN"),
@@ -314,9 +308,7 @@ _PNG_BOMB = bytes.fromhex("89504e470d0a1a0a0000000d49484452000f4240 0007a120 080
 
 FILES = [
     Fault("a FIFO as a scene", INFO, fifo("scene.ply"), "FIFO"),
-    Fault("a FIFO as a scene, drawn", DRAW, fifo("scene.ply"), "FIFO"),
     Fault("a FIFO as a scene, viewed", "pansplat-view scene.ply --offscreen out", fifo("scene.ply"), "scene.ply"),
-    Fault("a FIFO as a scene, refined", "refine scene.ply -o out.ply --photographs pair", fifo("scene.ply"), "FIFO"),
     Fault("a device as a scene", INFO, link("scene.ply", "/dev/zero"), "device"),
     Fault("a socket as a scene", INFO, unix_socket("scene.ply"), "socket"),
     Fault("a link to itself as a scene", INFO, link("scene.ply", "scene.ply"), "scene.ply"),
@@ -332,31 +324,21 @@ FILES = [
     Fault("a FIFO as a mask", PREDICT, fifo("pair/a_mask.png"), "", 0),
     Fault("a FIFO as weights", WEIGHTS, fifo("weights.safetensors"), "FIFO"),
     Fault("a FIFO as a pose", "render scene.ply -o x.png --pose p.json", fifo("p.json"), "FIFO"),
-    Fault("a FIFO as the numbers of a pose", "render scene.ply -o x.png --pose p.txt", fifo("p.txt"), "FIFO"),
     Fault("a FIFO as a pair", "predict fifo -o out.ply", fifo("fifo"), "fifo"),
     Fault("a video", "pose f.mp4 -o poses.json", lambda f: (f / "f.mp4").touch(), "write frames of it into a folder (mkdir FOLDER; ffmpeg"),
     Fault("poses in a missing folder", "pose pair -o no/poses.json", says="existing folder"),
     Fault("poses of an unknown format", "pose pair -o poses.txt", says="--out must end in"),
     Fault("poses of a folder without panoramas", "pose empty -o poses.json", lambda f: (f / "empty").mkdir(), "empty: needed panoramas"),
     Fault("a FIFO as an output", f"{PREDICT.replace('out.ply', 'f.ply')}", fifo("f.ply"), "FIFO"),
-    Fault("a FIFO as an image to write", DRAW.replace("x.png", "f.png"), fifo("f.png"), "FIFO"),
     Fault("an output that is a folder", PREDICT.replace("out.ply", "d.ply"), lambda f: (f / "d.ply").mkdir(), "--out d.ply"),
-    Fault("an output in a file", PREDICT.replace("out.ply", "scene.ply/out.ply"), says="existing folder"),
     Fault("an output of 300 bytes", PREDICT.replace("out.ply", f"{_LONG}.ply"), says="too long"),
     Fault("an output of 250 bytes works", PREDICT.replace("out.ply", f"{'a' * 250}.ply"), status=0),
     Fault("an output in /proc", PREDICT.replace("out.ply", "/proc/out.ply"), says="/proc/out.ply"),
-    *(Fault(f"{command[:12]}: an output folder that is a file", command.format("scene.ply"), says="scene.ply") for command in (
-        "evaluate pair --model sphere --out {}", "bench model --out {}",
-        "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
-    *(Fault(f"{command[:12]}: an output folder of 300 bytes", command.format(_LONG), says="too long") for command in (
-        "evaluate pair --model sphere --out {}", "bench refine --out {}",
-        "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
-    *(Fault(f"{command[:12]}: an output folder in a file", command.format("scene.ply/a/b"), says="scene.ply") for command in (
-        "evaluate pair --model sphere --out {}", "pansplat-view scene.ply --offscreen {}", "pansplat-train tiny --out {}")),
-    *(Fault(f"{command[:12]}: an output folder in /proc", command.format("/proc/a"), says="/proc") for command in (
+    *(Fault(f"{command[:12]}: an output folder {name}", command.format(folder), says=says) for name, folder, says in (
+        ("that is a file", "scene.ply", "scene.ply"), ("of 300 bytes", _LONG, "too long"), ("in a file", "scene.ply/a/b", "scene.ply"), ("in /proc", "/proc/a", "/proc")) for command in (
         "evaluate pair --model sphere --height 64 --out {}", "pansplat-train tiny --data.workers 0 --perceptual structure --device cpu --out {}")),
+    *(Fault(f"{command[:12]}: an output folder that is a file", command, says="scene.ply") for command in ("bench model --out scene.ply", "pansplat-view scene.ply --offscreen scene.ply")),
     Fault("image: 10^6 x 5 10^5 pixels", PREDICT, lambda f: (f / "pair/a.png").write_bytes(_PNG_BOMB), "a.png"),
-    Fault("image: one pixel", PREDICT, resized(1, 1), "2:1"),
     Fault("image: square", PREDICT, resized(32, 32), "2:1"),
     Fault("image: transparent", PREDICT, resized(32, 16, "RGBA"), "a.png"),
     Fault("image: an EXR of NaN", PREDICT, write_nan, "a.png"),
@@ -365,7 +347,6 @@ FILES = [
     Fault("mask: of a text", PREDICT, lambda f: (f / "pair/a_mask.png").write_text("x"), "a_mask.png"),
     Fault("mask: black", PREDICT, lambda f: Image.new("L", (32, 16)).save(f / "pair/a_mask.png"), "a_mask.png"),
     Fault("a pair that is an empty folder", "predict empty -o out.ply", lambda f: (f / "empty").mkdir(), "empty"),
-    Fault("a pair that is missing", "predict nowhere -o out.ply", says="nowhere"),
     Fault("an export without a scene", "export none.spz -o x.ply", says="none.spz: needed a .spz scene"),
     Fault("a scene that is no .spz", "info x.spz", content(b"PK" * 99, "x.spz"), says="got a file that starts with"),
     Fault("a .sog of zeros", "info x.sog", content(b"PK\3\4" + bytes(99), "x.sog"), says="x.sog: needed a complete"),
@@ -376,7 +357,6 @@ FILES = [
         ("of an unknown step", "--do predict,fly", "got 'fly'"), ("of an unknown format", "--format obj", "--format"), ("of points", "--format ply --gaussians 9", "--gaussians is for"),
         ("with workers of two kinds", "--workers 2 --scheduler tcp://a:1", "leave it out with --scheduler"), ("with no workers", "--workers 0", "--workers"),
         ("of an unknown model", "--model swepe", "got 'swepe'"))),
-    Fault("a batch of a missing folder", "batch nowhere --out out", says="nowhere"),
     Fault("a batch of a folder without panoramas", "batch empty --out out", lambda f: (f / "empty").mkdir(), "empty: needed folders with panoramas"),
     Fault("a batch into a file", "batch pair --out scene.ply", says="--out scene.ply"),
     Fault("a panorama is a pair of one view", "predict pair/a.png -o out.ply", status=0),

@@ -7,11 +7,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from pansplat.gaussians.harmonics import (
-    evaluate_harmonics,
-    harmonics_basis,
-    rotate_harmonics,
-)
+from pansplat.gaussians.harmonics import evaluate_harmonics, harmonics_basis, rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 
 

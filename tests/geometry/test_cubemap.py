@@ -3,13 +3,7 @@
 import pytest
 import torch
 
-from pansplat.geometry.cubemap import (
-    FACES,
-    equirect_from_strip,
-    face_rotations,
-    strip_from_equirect,
-    strip_lookup,
-)
+from pansplat.geometry.cubemap import FACES, equirect_from_strip, face_rotations, strip_from_equirect, strip_lookup
 from pansplat.geometry.equirect import pixel_directions
 
 

@@ -5,15 +5,7 @@ import math
 import pytest
 import torch
 
-from pansplat.geometry.path import (
-    ease_in_out,
-    fly_pose,
-    level_pose,
-    look_pose,
-    path_poses,
-    turn_pose,
-    up_direction,
-)
+from pansplat.geometry.path import ease_in_out, fly_pose, level_pose, look_pose, path_poses, turn_pose, up_direction
 from pansplat.geometry.pose import orthonormal_error
 
 

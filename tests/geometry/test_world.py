@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.geometry.world import USER_FRAME, WorldFrame, choose_frame, choose_unit, require_depth_range
 
 
@@ -19,8 +19,7 @@ def test_the_working_world_has_its_smallest_depth_near_a_metre(near: float) -> N
 
 @pytest.mark.parametrize("near", [0.0, -1.0, math.nan, 1e-300, 1e-40, 10.0, 9.9999])
 def test_depth_ranges_without_extent_are_refused(near: float) -> None:
-    with pytest.raises(InputError, match=r"poses\.json: needed"):
-        require_depth_range(near, 10.0, "poses.json")
+    expect_error(r"poses\.json: needed", require_depth_range, near, 10.0, "poses.json")
 
 
 def test_a_world_of_metres_around_its_origin_is_kept() -> None:

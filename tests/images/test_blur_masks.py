@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from refusals import expect_error
 
 from pansplat import pipeline
 from pansplat.cli.pose import Pose
@@ -135,7 +136,7 @@ def test_every_read_of_a_photograph_is_blurred(tmp_path: Path, suffix: str) -> N
 def test_black_masks_change_nothing_and_a_mask_of_most_is_noted(tmp_path: Path) -> None:
     plain = read_panorama(_write(tmp_path / "plain.png", 1, None), HEIGHT)[0]
     assert torch.equal(read_panorama(_write(tmp_path / "a.png", 1, np.zeros_like(HIDDEN)), HEIGHT)[0], plain)
-    with pytest.warns(InputWarning, match=r"b_blur\.png: 9\d% of the photograph is blurred; white is blurred"):
+    with pytest.warns(InputWarning, match=r"b_blur\.png: 9\d%"):
         read_panorama(_write(tmp_path / "b.png", 1, ~HIDDEN), HEIGHT)
 
 
@@ -158,18 +159,14 @@ def test_damaged_and_white_masks_are_refused(tmp_path: Path) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     mask = folder / "left_blur.png"
     Image.new("L", (128, 64), 255).save(mask)
-    with pytest.raises(InputError, match=r"left_blur\.png: needed a blur mask with black .* got white only"):
-        load_pairs(folder)[0].load_context(HEIGHT)
+    expect_error(r"left_blur\.png: .*white only", lambda: load_pairs(folder)[0].load_context(HEIGHT))
     Image.new("L", (64, 64)).save(mask)
     for path in (folder, folder / "left.png"):
-        with pytest.raises(InputError, match=r"left_blur\.png: needed a mask of the proportions .* 128x64, got 64x64"):
-            load_pairs(path)
+        expect_error(r"left_blur\.png: .*128x64, got 64x64", load_pairs, path)
     _draw_mask(mask)
     mask.write_bytes(mask.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"left_blur\.png: needed .* got damaged or truncated data"):
-        load_pairs(folder)
-    with pytest.raises(InputError, match=r"left_blur\.png: needed .* got damaged or truncated data"):
-        read_panorama(folder / "left.png", HEIGHT)
+    for read in (lambda: load_pairs(folder), lambda: read_panorama(folder / "left.png", HEIGHT)):
+        expect_error(r"left_blur\.png: .*damaged", read)
 
 
 def _draw_mask(path: Path, hidden: np.ndarray = HIDDEN, kind: str = "blur") -> Path:
@@ -180,92 +177,54 @@ def _draw_mask(path: Path, hidden: np.ndarray = HIDDEN, kind: str = "blur") -> P
     return path
 
 
-@pytest.mark.parametrize(
-    "name", ["left_blur.PNG", "left_Blur.png", "LEFT_BLUR.PNG", "left_blur.png.png", "left_mask.PNG", "Left_Mask.png"]
-)
+@pytest.mark.parametrize("name", ["left_Blur.png", "LEFT_BLUR.PNG", "left_blur.png.png", "Left_Mask.PNG"])
 @pytest.mark.parametrize("is_posed", [True, False])
 def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool) -> None:
-    kind = "blur" if "blur" in name.lower() else "mask"
-    for part in ("plain", "other"):
-        folder = _write_pair(tmp_path / part, 1)
-        for mask in folder.glob("*_blur.png"):
-            mask.unlink()
-    _draw_mask(tmp_path / "plain" / f"left_{kind}.png", kind=kind)
-    _draw_mask(tmp_path / "other" / name, kind=kind)
-    reads = []
-    for part in ("plain", "other"):
-        if is_posed:
-            panoramas = load_pairs(tmp_path / part)[0].context
-        else:
-            (tmp_path / part / "poses.json").unlink()
-            panoramas = tuple(load_panoramas(tmp_path / part))
-        assert [view.name for view in panoramas] == ["left", "right"]
-        pair = load_pairs(tmp_path / part / "left.png")[0]
-        views = [Pair("", tmp_path, (view,), (), 1, 2).load_context(HEIGHT) for view in panoramas]
-        views.append(pair.load_context(HEIGHT))
-        reads.append([tensor for view in views for tensor in (view.images, view.masks)])
-    for plain, other in zip(*reads, strict=True):
-        assert torch.equal(plain, other)
-    assert not torch.equal(reads[0][0][0], torch.from_numpy(_make_photograph(1)).permute(2, 0, 1) / 255) or (
-        not reads[0][1].all()
-    ), "the mask is applied"
+    folder = _write_pair(tmp_path / "pair", 1)
+    for mask in folder.glob("*_blur.png"):
+        mask.unlink()
+    if not is_posed:
+        (folder / "poses.json").unlink()
+    mask = _draw_mask(folder / name, kind="blur" if "blur" in name.lower() else "mask")
+    panoramas = load_pairs(folder)[0].context if is_posed else load_panoramas(folder)
+    assert [view.name for view in panoramas] == ["left", "right"]
+    for view in (panoramas[0], load_pairs(folder / "left.png")[0].context[0]):
+        assert mask in (view.mask, find_blur_mask(view.image))
 
 
 @pytest.mark.parametrize("name", ["mask.PNG", "Mask.png"])
 def test_the_mask_of_a_folder_is_one_in_any_case(tmp_path: Path, name: str) -> None:
-    folders = [_write_pair(tmp_path / "pair", 1), _write_sequence(tmp_path / "walk")]
-    for folder in folders:
-        _draw_mask(folder / name, kind="mask")
-        assert torch.equal(load_pairs(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN)), folder
-
-
-def _write_sequence(folder: Path) -> Path:
-    """Two frames in image/ with the poses of 360Loc."""
-    poses = {f"{number}.png": np.eye(4).tolist() for number in (0, 1)}
-    poses["1.png"][0][3] = 1.0
-    for number, name in enumerate(poses):
-        _write(folder / "image" / name, number, None)
-    (folder / "camera_pose.json").write_text(json.dumps(poses))
-    return folder
-
-
-NEAR_LEFT = r"did you mean (\S*/)?left_"
+    folder = _write_pair(tmp_path / "pair", 1)
+    _draw_mask(folder / name, kind="mask")
+    assert torch.equal(load_pairs(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN))
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("name", "right"),
     [
-        (
-            "lefd_Blur.PNG",
-            rf"lefd_Blur\.PNG: needed the name of a panorama before _blur.* got 'lefd_\S*' \({NEAR_LEFT}blur",
-        ),
-        ("left_blur.jpg", r"needed the name .* got 'left_blur\.jpg' \(did you mean left_blur\.png\?\)"),
-        ("lefd_mask.png", rf"lefd_mask\.png: needed the name of a panorama .* got 'lefd_\S*' \({NEAR_LEFT}mask\.png"),
-        (
-            "left_Mask.JPG",
-            r"left_Mask\.JPG: needed the name .* got 'left_Mask\.JPG' \(did you mean left_mask\.png\?\); rename, conv",
-        ),
-        (
-            "mask.jpg",
-            r"mask\.jpg: needed the name of a panorama before _mask\.png, got 'mask\.jpg'; rename, convert or",
-        ),
-        (
-            "masks/left_blur.png",
-            rf"masks/left_blur\.png: needed the name .* got 'left_blur\.png' \({NEAR_LEFT}blur\.png",
-        ),
-        ("left_Blur.png", r"left\.png: needed one mask _blur, got left_Blur\.png, left_blur\.png; keep the right one"),
+        ("lefd_Blur.PNG", "left_blur.*"),
+        ("left_blur.jpg", "left_blur.png"),
+        ("lefd_mask.png", "left_mask.png"),
+        ("left_Mask.JPG", "left_mask.png"),
+        ("mask.jpg", ""),
+        ("masks/left_blur.png", "left_blur.png"),
     ],
 )
 @pytest.mark.parametrize("is_posed", [True, False])
-def test_a_mask_that_is_not_applied_is_refused(tmp_path: Path, name: str, message: str, is_posed: bool) -> None:
+def test_a_mask_that_is_not_applied_is_refused(tmp_path: Path, name: str, right: str, is_posed: bool) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     if not is_posed:
         (folder / "poses.json").unlink()
     _draw_mask(folder / name, kind="blur" if "blur" in name.lower() else "mask")
     for path in (folder, *([folder / "left.png"] if name == "left_blur.jpg" else [])):
-        with warnings.catch_warnings(), pytest.raises(InputError, match=message):
+        with warnings.catch_warnings(), pytest.raises(InputError, match=rf"{name}: needed the name.*{right}"):
             warnings.filterwarnings("ignore", message=r".*has no pose of left_blur\.jpg")
             load_pairs(path)
+
+
+def test_two_masks_of_a_panorama_are_refused(tmp_path: Path) -> None:
+    _draw_mask(_write_pair(tmp_path / "pair", 1) / "left_Blur.png")
+    expect_error(r"left\.png: .*left_Blur\.png, left_blur\.png", load_pairs, tmp_path / "pair")
 
 
 def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
@@ -289,18 +248,12 @@ def test_a_scene_file_is_no_mask(tmp_path: Path) -> None:
 def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     mask = _draw_mask(folder / "lefd_Blur.jpg") if source == "pose folder" else folder / "left_blur.png"
-    message = rf"{mask.name}: needed (a panorama, got the mask of another|the name of a panorama)"
     if source == "poses.json":  # written by older versions
         content = json.loads((folder / "poses.json").read_text())
         content["poses"][mask.name] = content["poses"]["left.png"]
         (folder / "poses.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=message):
-        if source == "file":
-            load_pairs(mask)
-        elif source == "poses.json":
-            load_pairs(folder)
-        else:
-            Pose(folder).run()
+    read = Pose(folder).run if source == "pose folder" else lambda: load_pairs(mask if source == "file" else folder)
+    expect_error(f"{mask.name}: needed", read)
 
 
 def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
@@ -310,8 +263,7 @@ def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
         (folder / "camera_pose.json").write_text(json.dumps({"frame_0.png": np.eye(4).tolist()}))
     assert read_loc360(tmp_path, "val")
     _draw_mask(folders[-1] / "image" / "frame_1_blur.png")
-    with pytest.raises(InputError, match=r"frame_1_blur\.png: needed the name .* \(did you mean frame_0_blur"):
-        read_loc360(tmp_path, "val")
+    expect_error(r"frame_1_blur\.png: .*frame_0_blur", read_loc360, tmp_path, "val")
 
 
 SIDE = 48  # pixels along a face
@@ -380,10 +332,7 @@ def test_a_blur_mask_of_a_picture_is_refused_and_the_mask_of_its_panorama_is_nam
     write, name = ASSEMBLED[kind]
     folder = write(tmp_path / "set", color_face, 1)
     mask = _draw_mask(folder / name, COVER)
-    with pytest.raises(
-        InputError, match=rf"{mask.name}: needed .* got '{mask.name}' \(did you mean \S*(hall|0000_a)_blur"
-    ):
-        load_pairs(folder)
+    expect_error(rf"{mask.name}: needed .*(hall|0000_a)_blur", load_pairs, folder)
     mask.unlink()
     _draw_mask(folder / f"{load_panoramas(folder)[0].name}_blur.png")
     assert find_blur_mask(_load_first(folder).image)
@@ -399,33 +348,26 @@ def test_a_scene_mask_beside_a_perspective_picture_masks_it_and_that_of_a_cube_f
     assert not masks[0, 34, 64] and masks[0, :, :32].all() and masks[1].all()
     folder = _write_faces(tmp_path / "faces", color_face, 1)
     _draw_mask(folder / "hall_f_mask.png", COVER, kind="mask")
-    with pytest.raises(InputError, match=r"hall_f_mask\.png: needed the name .* \(did you mean hall_mask\.png\?\)"):
-        load_pairs(folder)
+    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_pairs, folder)
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "size", "message"),
+    ("kind", "name", "got"),
     [
-        (
-            "faces",
-            "hall_blur.png",
-            (48, 48),
-            r"hall_blur\.png: needed a mask of the proportions .* 192x96, got 48x48",
-        ),
-        ("colmap", "images/0000_a_blur.png", (64, 32), r"0000_a_blur.png: needed .*did you mean \S*/set/0000_a_blur"),
-        ("nerfstudio", "images/0000_a_frond_blur.png", (48, 48), r"frond_blur.* \(did you mean \S*/0000_a_blur"),
-        ("colmap", "masks/0000_a_frond.png.png", (48, 48), r"frond\.png\.png: needed the name of a picture"),
-        ("nerfstudio", "masks/0000_a_front_blur.png", (48, 48), r"masks/0000_a_front_blur\.png: needed the name"),
+        ("faces", "hall_blur.png", "192x96, got 48x48"),
+        ("colmap", "images/0000_a_blur.png", "set/0000_a_blur"),
+        ("nerfstudio", "images/0000_a_frond_blur.png", "/0000_a_blur"),
+        ("colmap", "masks/0000_a_frond.png.png", "the name of a picture"),
+        ("nerfstudio", "masks/0000_a_front_blur.png", "the name"),
     ],
 )
 def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(
-    tmp_path: Path, kind: str, name: str, size: tuple[int, int], message: str, color_face: Callable
+    tmp_path: Path, kind: str, name: str, got: str, color_face: Callable
 ) -> None:
-    folder = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1)
-    (folder / name).parent.mkdir(exist_ok=True)
-    Image.new("L", size).save(folder / name)
-    with pytest.raises(InputError, match=message):
-        load_pairs(folder)
+    mask = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1) / name
+    mask.parent.mkdir(exist_ok=True)
+    Image.new("L", (48, 48)).save(mask)
+    expect_error(f"{mask.name}: needed.*{got}", load_pairs, tmp_path / "set")
 
 
 @pytest.mark.parametrize("name", ["0000_a_front.png.png", "0000_A_front.PNG.png", "0000_a_front.png"])
@@ -442,8 +384,7 @@ def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path, color_face: Ca
     content = json.loads(file.read_text())
     content["frames"][3]["mask_path"] = "masks/a.png"
     file.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"frame 3: needed the mask masks/a\.png, got no such file"):
-        load_pairs(file.parent)
+    expect_error(r"frame 3: .*masks/a\.png", load_pairs, file.parent)
 
 
 def test_a_mask_beside_a_rig_is_that_of_its_panorama(tmp_path: Path, color_face: Callable) -> None:
@@ -469,8 +410,7 @@ def test_masks_beside_a_link_are_applied_and_those_beside_its_file_are_refused(t
     _link(folder / "left.png", moved)
     assert find_blur_mask(_load_first(folder).image) == folder / "left_blur.png"
     (folder / "left_blur.png").rename(tmp_path / "store" / "left_blur.png")
-    with pytest.raises(InputError, match=r"store/left_blur\.png: needed the name of a panorama"):
-        load_pairs(folder)
+    expect_error(r"store/left_blur\.png: needed", load_pairs, folder)
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
@@ -530,7 +470,6 @@ def test_a_web_tour_names_the_picture_of_its_masks(tmp_path: Path) -> None:
     tour = {"scenes": {"kitchen": {"type": "equirectangular", "panorama": "panos/IMG_1.png"}}}
     (tmp_path / "tour.json").write_text(json.dumps(tour))
     _draw_mask(tmp_path / "kitchen_blur.png")
-    with pytest.raises(InputError, match=r"kitchen_blur\.png: needed the name .*did you mean \S*IMG_1_blur\.png"):
-        load_pairs(tmp_path)
+    expect_error(r"kitchen_blur\.png: .*IMG_1_blur\.png", load_pairs, tmp_path)
     (tmp_path / "kitchen_blur.png").rename(tmp_path / "panos" / "IMG_1_Blur.PNG")
     assert find_blur_mask(_load_first(tmp_path).image) == tmp_path / "panos" / "IMG_1_Blur.PNG"

@@ -6,16 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
-from pansplat.images.cube_images import (
-    COLUMN,
-    ROW,
-    CubeImage,
-    CubeLevel,
-    equirect_from_faces,
-    write_cube,
-)
+from pansplat.images.cube_images import COLUMN, ROW, CubeImage, CubeLevel, equirect_from_faces, write_cube
 from pansplat.images.image_files import read_height, read_panorama, read_pixels, read_thumbnail
 
 
@@ -103,5 +96,4 @@ def test_cubes_of_one_name_and_folder_have_files_of_their_own(cube: CubeImage, t
 def test_missing_pictures_are_named(cube: CubeImage, tmp_path: Path) -> None:
     path = write_cube(cube, tmp_path, "hall")
     (tmp_path / "40/l/1_2.jpg").unlink()
-    with pytest.raises(InputError, match=r"l/1_2\.jpg: needed a readable image file"):
-        read_panorama(path, 80)
+    expect_error(r"l/1_2\.jpg: needed a readable image file", read_panorama, path, 80)

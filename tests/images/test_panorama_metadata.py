@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from av.sidedata.sidedata import Type
 from PIL import Image
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.images.image_files import read_depth, read_panorama, write_depth, write_image
 from pansplat.images.panorama_metadata import mark_spherical_video
 from pansplat.images.video import write_video
@@ -96,7 +96,5 @@ def test_depth_is_in_millimetres_and_saturates(tmp_path: Path) -> None:
         assert "millimetres" in image.info["Description"]
     back = read_depth(tmp_path / "d.png", 2).numpy()
     np.testing.assert_allclose(back[1], [2, 3, 4, 5], atol=1e-6)
-    with pytest.raises(InputError, match=r"ending in \.png"):
-        write_depth(tmp_path / "d.jpg", depth)
-    with pytest.raises(InputError, match="NaN"):
-        write_depth(tmp_path / "d.png", depth * np.nan)
+    expect_error(r"ending in \.png", write_depth, tmp_path / "d.jpg", depth)
+    expect_error("NaN", write_depth, tmp_path / "d.png", depth * np.nan)

@@ -12,15 +12,11 @@ import pytest
 import torch
 from numpy import ndarray as Array
 from PIL import Image
+from refusals import expect_error
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.images.image_files import (
-    read_panorama,
-    read_size,
-    read_thumbnail,
-    write_image,
-)
+from pansplat.images.image_files import read_panorama, read_size, read_thumbnail, write_image
 from pansplat.inputs.folders import load_pairs
 
 SIZE = 64
@@ -61,14 +57,12 @@ def test_16_bits_are_read_at_full_precision(tmp_path: Path, pixels: Array, name:
     image = read_panorama(tmp_path / name, SIZE)[0].permute(1, 2, 0).numpy()
     assert np.abs(image * 65535 - deep).max() < 0.1
     (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-200])
-    with pytest.raises(InputError, match="needed a complete image, got damaged or truncated data"):
-        read_panorama(tmp_path / name, SIZE)
+    expect_error("needed a complete image, got damaged or truncated data", read_panorama, tmp_path / name, SIZE)
 
 
 def test_tiff_of_floating_point_numbers_is_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.tif"), np.full((16, 32, 3), 0.5, np.float32))
-    with pytest.raises(InputError, match=r"a\.tif: needed a readable PNG or TIFF of 8 or 16 bits|needed a .* image"):
-        read_panorama(tmp_path / "a.tif", 16)
+    expect_error(r"a\.tif: needed", read_panorama, tmp_path / "a.tif", 16)
 
 
 ORIENT: dict[int, Callable[[Array], Array]] = {  # how a picture is stored for each EXIF orientation
@@ -138,10 +132,7 @@ def test_parts_of_panoramas_and_other_projections_are_refused_by_what_they_state
         ("c", r"the projection 'cylindrical' \(GPano:ProjectionType\); convert it"),
     ):
         for read in (load_pairs, lambda path: read_panorama(path, 16), lambda path: read_thumbnail(path, 16)):
-            with pytest.raises(
-                InputError, match=rf"{name}\.jpg: needed a full equirectangular panorama, got {problem}"
-            ):
-                read(tmp_path / f"{name}.jpg")
+            expect_error(rf"{name}\.jpg: .*, got {problem}", read, tmp_path / f"{name}.jpg")
 
 
 def test_metadata_that_contradict_the_picture_or_are_no_numbers_count_for_nothing(tmp_path: Path) -> None:
@@ -167,11 +158,9 @@ def test_dual_fisheye_pictures_are_named(tmp_path: Path, pixels: Array) -> None:
         lambda: read_panorama(tmp_path / "R0010001.JPG", 32),
         lambda: load_pairs(tmp_path)[0].load_context(32),
     ):
-        with pytest.raises(InputError, match=r"R0010001\.JPG: .*got a dual fisheye picture; stitch it.*v360=dfisheye"):
-            call()
+        expect_error(r"R0010001\.JPG: .*got a dual fisheye picture; stitch it.*v360=dfisheye", call)
     Image.fromarray(_fisheye(64, 1)).save(tmp_path / "one.jpg")
-    with pytest.raises(InputError, match="stitch a fisheye picture with the program of its camera"):
-        load_pairs(tmp_path / "one.jpg")
+    expect_error("stitch a fisheye picture with the program of its camera", load_pairs, tmp_path / "one.jpg")
     capped = pixels.copy()  # panoramas with black poles are no fisheye pictures
     capped[:12] = capped[-12:] = 0
     for number, picture in enumerate((capped, pixels // 8, np.zeros_like(pixels))):
@@ -181,21 +170,16 @@ def test_dual_fisheye_pictures_are_named(tmp_path: Path, pixels: Array) -> None:
 
 def test_files_of_cameras_and_videos_name_what_to_do(tmp_path: Path) -> None:
     for name, message in (
-        (
-            "walk.mp4",
-            r"got the video walk\.mp4; write frames of it into a folder \(mkdir FOLDER; ffmpeg -i .*walk\.mp4",
-        ),
+        ("walk.mp4", r"got the video walk\.mp4; .*ffmpeg -i .*walk\.mp4"),
         ("IMG_1.HEIC", r"got IMG_1\.HEIC; convert it to JPG"),
         ("IMG_1.insp", r"got IMG_1\.insp, which the program of its camera must stitch; export it as a 2:1 JPG"),
     ):
         (tmp_path / name).write_bytes(b"x")
         for path in (tmp_path, tmp_path / name):
-            with pytest.raises(InputError, match=message):
-                load_pairs(path)
+            expect_error(message, load_pairs, path)
         (tmp_path / name).unlink()
     (tmp_path / "poses.csv").write_text("x,y,z")
-    with pytest.raises(InputError, match=r"got none, and poses\.csv, of no known format; .*docs/input\.md lists"):
-        load_pairs(tmp_path)
+    expect_error(r"got none, and poses\.csv, of no known format; .*docs/input\.md lists", load_pairs, tmp_path)
 
 
 def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:

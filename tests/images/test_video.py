@@ -6,8 +6,8 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.images.video import video_encoder, write_video
 
 
@@ -61,6 +61,5 @@ def test_a_failing_source_keeps_the_old_file(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_arguments_are_refused(tmp_path: Path, name, frames, fps, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        write_video(tmp_path / name, frames(), fps)
+    expect_error(message, lambda: write_video(tmp_path / name, frames(), fps))
     assert list(tmp_path.iterdir()) == []

@@ -111,10 +111,7 @@ def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (
-            {"p01.jpg": [{"to": "p09.jpg", "yaw": 0}]},
-            "a link of p01 is left out: it leads to 'p09.jpg', which is no panorama",
-        ),
+        ({"p01.jpg": [{"to": "p09.jpg", "yaw": 0}]}, "a link of p01 is left out: .*'p09.jpg'"),
         ({"p09.jpg": []}, "'p09.jpg' is left out: it is no panorama of the folder"),
         ({"p01.jpg": [{"to": "p02.jpg"}]}, "links of p01 are left out: .*yaw: needed a number, got None"),
         ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "links of p01 are left out: .*yaw: needed a number"),

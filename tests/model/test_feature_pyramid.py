@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.model.feature_pyramid import (
     FeaturePyramid,
     FeaturePyramidConfig,
@@ -47,8 +47,7 @@ def test_decoding_images_one_by_one_equals_decoding_all_at_once(small):
     ],
 )
 def test_unusable_views_and_sizes_are_refused(compat, shape, message):
-    with pytest.raises(InputError, match=message):
-        FeaturePyramid(_SMALL, compat)(torch.zeros(shape))
+    expect_error(message, lambda: FeaturePyramid(_SMALL, compat)(torch.zeros(shape)))
 
 
 # Transformer
@@ -78,5 +77,4 @@ def test_a_repeated_view_changes_nothing(transformer):
 
 
 def test_a_map_that_cannot_be_split_into_windows_is_refused(transformer):
-    with pytest.raises(InputError, match="that 4 divides, got 6x12"):
-        transformer()(_noise(1, 2, 16, 6, 12))
+    expect_error("that 4 divides, got 6x12", lambda: transformer()(_noise(1, 2, 16, 6, 12)))

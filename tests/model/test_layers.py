@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.model.layers import (
     PanoramaConv2d,
     attend,
@@ -86,5 +86,4 @@ def test_a_pose_that_is_not_rigid_is_refused(break_rotation):
     poses = torch.eye(4).repeat(2, 3, 1, 1)
     require_rigid(poses)
     poses[1, 2, :3, :3] = break_rotation(poses[1, 2, :3, :3])
-    with pytest.raises(InputError, match="of item 1, view 2 must be a rigid pose"):
-        require_rigid(poses)
+    expect_error("of item 1, view 2 must be a rigid pose", require_rigid, poses)

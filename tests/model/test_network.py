@@ -10,16 +10,16 @@ from typing import Literal
 import pytest
 import torch
 from fake_card import CARD, pretend_card
+from refusals import expect_error
 from torch import Tensor
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputWarning
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.model.heads import TileGaussians
 from pansplat.model.network import (
     NetworkPredictor,
-    build_empty_network,
     build_network,
     convert_checkpoint,
     load_predictor,
@@ -107,15 +107,16 @@ def test_predictions_carry_no_gradient(predictor, prediction):
     assert torch.is_grad_enabled()
 
 
-def test_the_fingerprint_depends_on_weights_settings_and_compatibility(small_config):
+def test_the_fingerprint_depends_on_weights_settings_compatibility_and_precision(small_config, file):
     other = dataclasses.replace(small_config, heads=dataclasses.replace(small_config.heads, depth="swept"))
     predictors = (
         _predictor(small_config),
         _predictor(small_config, seed=1),
         _predictor(small_config, "official"),
         _predictor(other),
+        load_predictor(file, attention_precision="bfloat16"),
     )
-    assert len({predictor.fingerprint for predictor in predictors}) == 4
+    assert len({predictor.fingerprint for predictor in predictors}) == 5
     assert _predictor(small_config).fingerprint == predictors[0].fingerprint
 
 
@@ -127,8 +128,7 @@ def refuse(small_config, unchecked):
     """Check that a prediction is refused with a message."""
 
     def check(match: str, images: torch.Tensor, poses: torch.Tensor, near=0.5, far=20.0, compat="fixed", **options):
-        with pytest.raises(InputError, match=match):
-            _predictor(small_config, compat)(images, poses, near, far, **options)
+        expect_error(match, lambda: _predictor(small_config, compat)(images, poses, near, far, **options))
 
     return check
 
@@ -232,13 +232,6 @@ def test_a_loaded_network_predicts_as_the_saved_one(file: Path, small_config: Pa
     assert torch.allclose(means, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_compat_and_precision_change_the_fingerprint(file: Path) -> None:
-    fixed, official = load_predictor(file, "fixed"), load_predictor(file, "official")
-    rounded = load_predictor(file, attention_precision="bfloat16")
-    assert len({predictor.fingerprint for predictor in (fixed, official, rounded)}) == 3
-    assert not torch.allclose(fixed(*_inputs(), 0.5, 10.0).means, official(*_inputs(), 0.5, 10.0).means)
-
-
 def test_loading_draws_no_random_numbers_and_fills_every_tensor(file: Path) -> None:
     torch.manual_seed(0)
     expected = torch.rand(3)
@@ -269,42 +262,27 @@ def test_files_that_fit_no_network_are_refused(small_config: PanSplatConfig, unc
         (dataclasses.replace(good, model="mvsplat"), "needed weights of pansplat, got weights of 'mvsplat'"),
         (dataclasses.replace(good, config={"channels": 16}), r"x: config: needed the settings of this version"),
         (dataclasses.replace(good, config=good.config | {"features": 3}), "features: needed an object"),
+        (dataclasses.replace(good, config=good.config | {"heads": good.config["heads"] | {"candidates": 7}}), "got 7"),
         (dataclasses.replace(good, tensors=tensors | {"new": torch.zeros(1)}), r"found unknown 1 \(new\)"),
         (dataclasses.replace(good, config=wider), r"got \d+ \(features\.transformer"),
     ]
     for weights, message in odd:
-        with pytest.raises(InputError, match=message):
-            build_network(weights, "fixed", "x")
-
-
-def test_settings_that_contradict_each_other_are_refused() -> None:
-    good = pack_weights("pansplat", PanSplatConfig(), {}, compat="fixed")
-    wrong = good.config | {"heads": good.config["heads"] | {"candidates": 7}}
-    with pytest.raises(InputError, match=r"`heads\.candidates` must be the 32 of the finest sweep, got 7; correct it"):
-        build_empty_network(dataclasses.replace(good, config=wrong), "fixed", "x")
+        expect_error(message, build_network, weights, "fixed", "x")
 
 
 def test_invalid_choices_are_refused(file: Path, unchecked: None) -> None:
-    with pytest.raises(InputError, match="`compat` must be one of trained, official, fixed, got 'broken'"):
-        load_model(file, compat="broken")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="`compat` is for networks, and sweep is not one"):
-        load_model("sweep", compat="fixed")
-    with pytest.raises(InputError, match="`config` is for networks, and default is not one"):
-        load_model("default", config=None)
-    with pytest.raises(InputError, match=r"`precision` is for networks, and .*model\.safetensors is not one"):
-        load_model(default_weights(), precision="bfloat16")
-    with pytest.raises(InputError, match="got no file"):
-        load_model(file.with_name("other.safetensors"))
-    with pytest.raises(InputError, match=r"a file of weights \(\.safetensors, \.ckpt, \.pt, \.pth\), got .*scene\.ply"):
-        load_model(file.with_name("scene.ply"))
+    expect_error("`compat` must be one of trained, official, fixed, got 'broken'", load_model, file, compat="broken")
+    expect_error("`compat` is for networks, and sweep is not one", load_model, "sweep", compat="fixed")
+    expect_error("`config` is for networks, and default is not one", load_model, "default", config=None)
+    expect_error(r"`precision` .*model\.safetensors", lambda: load_model(default_weights(), precision="bfloat16"))
+    expect_error("got no file", lambda: load_model(file.with_name("other.safetensors")))
+    expect_error(r"\.safetensors, .*got .*scene\.ply", lambda: load_model(file.with_name("scene.ply")))
 
 
 def test_a_processor_without_bfloat16_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_f": True, "avx512_bf16": False})
-    with pytest.raises(InputError, match=r"got one without them; use float32"):
-        require_precision("bfloat16")
+    expect_error(r"got one without them; use float32", require_precision, "bfloat16")
     require_precision("float32")
-    with pytest.raises(InputError, match="float32 or bfloat16, got 'float16'"):
-        require_precision("float16")
+    expect_error("float32 or bfloat16, got 'float16'", require_precision, "float16")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
     require_precision("bfloat16")

@@ -7,12 +7,7 @@ import torch
 from torch.nn import functional
 
 from pansplat.geometry.fibonacci import lattice_size
-from pansplat.model.tiles import (
-    crop_window,
-    make_lattice_uv,
-    make_tiles,
-    move_points,
-)
+from pansplat.model.tiles import crop_window, make_lattice_uv, make_tiles, move_points
 
 
 def _random(*shape: int) -> torch.Tensor:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from onnx_files import FakeSession, Node, write_onnx
+from refusals import expect_error
 
 from pansplat.errors import InputError
 from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
@@ -37,25 +38,21 @@ def test_fingerprint_changes_with_the_content_of_the_file(tmp_path):
 
 def test_missing_onnxruntime_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(InputError, match=r"a\.onnx: needed onnxruntime.*pansplat\[onnx\]"):
-        load_relative_depth(_channel_maximum(tmp_path / "a.onnx"))
+    expect_error(r"a\.onnx: .*pansplat\[onnx\]", lambda: load_relative_depth(_channel_maximum(tmp_path / "a.onnx")))
 
 
 def test_file_that_is_no_network_is_refused(tmp_path):
     pytest.importorskip("onnxruntime")
     path = tmp_path / "text.onnx"
     path.write_text("no network")
-    with pytest.raises(InputError, match=r"text\.onnx: needed an ONNX network that contains its weights, got '"):
-        load_relative_depth(path)
-    with pytest.raises(InputError, match=r"none\.onnx: needed an ONNX file"):
-        load_relative_depth(tmp_path / "none.onnx")
+    expect_error(r"text\.onnx: needed an ONNX network that contains its weights, got '", load_relative_depth, path)
+    expect_error(r"none\.onnx: needed an ONNX file", load_relative_depth, tmp_path / "none.onnx")
 
 
 def test_file_with_an_output_of_another_rank_is_refused(tmp_path):
     pytest.importorskip("onnxruntime")
     network = load_relative_depth(_channel_maximum(tmp_path / "kept.onnx", (1, 3, 28, 28), keep=1))
-    with pytest.raises(InputError, match=r"kept\.onnx: needed a network .* got outputs of shapes \(1, 1, 28, 28\)"):
-        network(torch.zeros(3, 28, 28))
+    expect_error(r"kept\.onnx: .*\(1, 1, 28, 28\)", lambda: network(torch.zeros(3, 28, 28)))
 
 
 @pytest.mark.parametrize(
@@ -69,7 +66,7 @@ def test_file_with_an_output_of_another_rank_is_refused(tmp_path):
     ],
 )
 def test_other_inputs_are_refused_and_named(inputs):
-    with pytest.raises(InputError, match=r"net\.onnx: needed a network .* got inputs image tensor"):
+    with pytest.raises(InputError, match=r"net\.onnx: .* inputs image tensor"):
         RelativeDepthNetwork(FakeSession(None, inputs), "net.onnx", "")
 
 
@@ -78,7 +75,7 @@ def _network(function):
 
 
 def test_output_that_is_not_finite_is_refused():
-    with pytest.raises(InputError, match=r"net\.onnx: .* got NaN or infinity"):
+    with pytest.raises(InputError, match=r"net\.onnx: .* NaN"):
         _network(lambda image: [np.full((1, 8, 8), np.nan)])(torch.zeros(3, 8, 8))
 
 
@@ -86,13 +83,11 @@ def test_failure_of_the_network_is_named():
     def fail(image):
         raise RuntimeError("Got invalid dimensions\nmore")
 
-    with pytest.raises(InputError, match=r"net\.onnx: .* got 'Got invalid dimensions' for an image of 8x8"):
-        _network(fail)(torch.zeros(3, 8, 8))
+    expect_error(r"net\.onnx: .*invalid dimensions. .* 8x8", lambda: _network(fail)(torch.zeros(3, 8, 8)))
 
 
 def test_constant_output_of_all_images_is_refused_and_of_some_accepted():
     images = torch.zeros(2, 3, 8, 8)
-    with pytest.raises(InputError, match=r"net\.onnx: .* got one constant value"):
-        _network(lambda image: [np.full((1, 8, 8), 3.0)]).estimate(images)
+    expect_error(r"net\.onnx: .* constant", lambda: _network(lambda image: [np.full((1, 8, 8), 3.0)]).estimate(images))
     images[1] = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
     assert len(_network(lambda image: [image[:, 0]]).estimate(images)) == 2

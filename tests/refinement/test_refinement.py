@@ -6,11 +6,12 @@ import math
 import pytest
 import torch
 from fake_card import CARD, pretend_card
+from refusals import expect_error
 from synthetic_scenes import make_balls
 
 import pansplat
 from pansplat import pipeline
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputWarning
 from pansplat.gaussians.scene import Gaussians, empty_gaussians
 from pansplat.geometry.pose import invert_pose
 from pansplat.refinement import RefineConfig, Refinement, fuse_views, refinement_fingerprint
@@ -304,16 +305,13 @@ def test_an_empty_scene_is_returned(room) -> None:
 )
 def test_photographs_that_do_not_fit_are_refused(room, change, message: str) -> None:
     scene, views = change(room.predicted, room.views)
-    with pytest.raises(InputError, match=message):
-        Refinement(scene, views)
+    expect_error(message, Refinement, scene, views)
 
 
 @pytest.mark.parametrize("limits", [{"seconds": 0.0, "steps": 1}, {"steps": 0}, {"seconds": math.nan, "steps": 1}])
 def test_invalid_limits_are_refused(room, limits: dict) -> None:
-    with pytest.raises(InputError, match="of a refinement"):
-        Refinement(room.predicted, room.views).run(**limits)
-    with pytest.raises(InputError, match="`gaussians` must be at least 1"):
-        RefineConfig(gaussians=0)
+    expect_error("of a refinement", lambda: Refinement(room.predicted, room.views).run(**limits))
+    expect_error("`gaussians` must be at least 1", RefineConfig, gaussians=0)
 
 
 def test_the_fingerprint_depends_on_the_settings() -> None:

@@ -5,10 +5,10 @@ import math
 
 import pytest
 import torch
+from refusals import expect_error
 from torch._dynamo.utils import counters
 
 from pansplat.bench.scenes import full_lattice_room
-from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
 from pansplat.rendering.rasterize import RasterOptions
@@ -38,11 +38,9 @@ def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
         ({"background": (0.1, 0.2)}, r"`background` must hold 3 numbers, .* got \(2,\)"),
     ]
     for options, message in cases:
-        with pytest.raises(InputError, match=message):
-            rasterize(scene, pose, **{"size": (4, 8), **options})
+        expect_error(message, rasterize, scene, pose, **{"size": (4, 8), **options})
     for bad in (2 * pose, torch.diag(torch.tensor((1.0, 1, -1, 1))), pose * math.nan, torch.eye(3)):
-        with pytest.raises(InputError, match="`cam2world` must be a rigid 4x4"):
-            rasterize(scene, bad, size=(4, 8))
+        expect_error("`cam2world` must be a rigid 4x4", rasterize, scene, bad, size=(4, 8))
     with pytest.raises(TypeError, match="unexpected keyword argument 'sharpness'"):
         rasterize(scene, pose, size=(4, 8), sharpness=2)
 

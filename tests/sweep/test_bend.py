@@ -8,11 +8,7 @@ import pytest
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.sweep import bend
-from pansplat.sweep.bend import (
-    bend_surfaces,
-    fit_field,
-    measure_evidence,
-)
+from pansplat.sweep.bend import bend_surfaces, fit_field, measure_evidence
 from pansplat.sweep.surface import Surface
 
 HEIGHT = 48

@@ -7,8 +7,8 @@ import pytest
 import torch
 from fake_card import CARD, pretend_card
 from onnx_files import Node, write_onnx
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.evaluation.metrics import ws_psnr
 from pansplat.model.weights import pack_weights, save_weights
 from pansplat.networks.depth_network import DepthNetworkConfig
@@ -16,11 +16,7 @@ from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
 from pansplat.pipeline import load_model, load_pairs, load_predictor, predict, render
 from pansplat.prediction_options import PredictOptions
-from pansplat.sweep.guided_sweep import (
-    NetworkPrior,
-    load_guided_sweep,
-    save_network,
-)
+from pansplat.sweep.guided_sweep import NetworkPrior, load_guided_sweep, save_network
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.surface import resize_sphere
 
@@ -123,16 +119,14 @@ def test_fingerprint_depends_on_the_weights(weights, tmp_path):
 def test_other_weights_are_refused(tmp_path):
     path = tmp_path / "other.safetensors"
     save_weights(path, pack_weights("pansplat", _CONFIG, {"a": torch.zeros(1)}, compat="fixed"))
-    with pytest.raises(InputError, match=r"needed weights of a depth network, got weights of 'pansplat'"):
-        load_guided_sweep(path)
+    expect_error(r"needed weights of a depth network, got weights of 'pansplat'", load_guided_sweep, path)
 
 
 def test_missing_weight_is_refused(tmp_path):
     network = _network()
     state = {name: tensor for name, tensor in network.state_dict().items() if name != "head.bias"}
     save_network(tmp_path / "part.safetensors", network, state)
-    with pytest.raises(InputError, match=r"head\.bias"):
-        load_guided_sweep(tmp_path / "part.safetensors")
+    expect_error(r"head\.bias", load_guided_sweep, tmp_path / "part.safetensors")
 
 
 @pytest.mark.slow
@@ -230,5 +224,4 @@ def test_depth_network_is_refused_by_models_without_a_depth_network(tmp_path):
     path = tmp_path / "other.safetensors"
     save_weights(path, pack_weights("pansplat", _CONFIG, {"a": torch.zeros(1)}, compat="fixed"))
     for name in ("sweep", path):
-        with pytest.raises(InputError, match=r"`depth_network` is for the model default, got the model "):
-            load_model(name, depth_network=tmp_path / "net.onnx")
+        expect_error("`depth_network` is for", load_model, name, depth_network=tmp_path / "net.onnx")

@@ -5,8 +5,9 @@ import types
 
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputWarning
 from pansplat.system import devices
 from pansplat.system.devices import choose_device, describe_devices, use_device, with_device
 
@@ -35,11 +36,9 @@ def choose(choice: devices.Device, *arguments: object, **options: object) -> str
 @pytest.mark.usefixtures("no_card")
 def test_without_a_card_all_work_is_the_processors_and_cuda_is_refused() -> None:
     assert choose("auto") == choose("cpu") == "cpu"
-    with pytest.raises(InputError, match="`device` cuda needs a graphics card that torch can use, got none"):
-        choose("cuda")
+    expect_error("`device` cuda needs a graphics card that torch can use, got none", choose, "cuda")
     assert "all work runs on the processor" in "\n".join(describe_devices())
-    with pytest.raises(InputError, match="`device` must be one of auto, cpu, cuda, got 'gpu'"):
-        choose("gpu")  # type: ignore[arg-type]
+    expect_error("`device` must be one of auto, cpu, cuda, got 'gpu'", choose, "gpu")
 
 
 @pytest.mark.usefixtures("card")

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.system.strict_json import MAX_DEPTH, parse_json, read_json
 
 _VALUES = st.recursive(
@@ -39,8 +39,7 @@ def test_valid_values_are_read_as_written(value: Any) -> None:
     ],
 )
 def test_other_texts_are_refused(text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        parse_json(text, "file")
+    expect_error(message, parse_json, text, "file")
 
 
 def test_the_deepest_allowed_list_is_read() -> None:
@@ -50,5 +49,4 @@ def test_the_deepest_allowed_list_is_read() -> None:
 def test_files_have_a_largest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pansplat.system.strict_json.MAX_BYTES", 10)
     (tmp_path / "a.json").write_text("[1, 2, 3, 4, 5]")
-    with pytest.raises(InputError, match=r"a\.json: needed .* of at most 10 bytes, got 15"):
-        read_json(tmp_path / "a.json")
+    expect_error(r"a\.json: needed .* of at most 10 bytes, got 15", read_json, tmp_path / "a.json")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy
 import torch
 from synthetic_scenes import make_balls
 
@@ -15,7 +14,7 @@ from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
 from pansplat.inputs.pairs import Pair, Panorama
 from pansplat.inputs.placements import ApproximatePlace, Placement
 from pansplat.tours import graph
-from pansplat.tours.graph import TourGraph, _find_shortest_ways, find_tours
+from pansplat.tours.graph import TourGraph, find_tours
 from pansplat.tours.route import plan_route
 
 
@@ -314,17 +313,6 @@ def test_next_nodes_lead_along_the_cheapest_walk(comb, home):
             while walk[-1] != end:
                 walk.append(following[walk[-1]][end])
             assert walk == tour.find_walk(start, end)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_cheapest_ways_are_those_of_scipy(seed):
-    costs = np.random.default_rng(seed).random((30, 30))
-    costs = np.where(costs < 0.03, costs, np.inf)
-    costs = np.minimum(costs, costs.T)
-    ways, previous = _find_shortest_ways(costs)
-    expected, nodes = scipy.sparse.csgraph.shortest_path(costs, directed=False, return_predecessors=True)
-    np.testing.assert_allclose(ways, expected)
-    assert (previous == nodes)[nodes >= 0].all() and np.isinf(expected).any()
 
 
 def test_an_edge_is_followed_until_another_one_is_clearly_nearer(comb):

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import expect_error
 
 from pansplat.errors import InputError
 from pansplat.model.weights import UnsafeCheckpointError, WeightsFile, save_weights
@@ -60,10 +61,8 @@ def test_a_full_disk_is_an_error_and_keeps_the_older_file(tmp_path: Path, full_d
     weights = WeightsFile("pansplat", {}, "fixed", {"a": torch.zeros(100_000)})
     save_checkpoint(tmp_path, 1, state(), keep=1)
     with full_disk(100_000):
-        with pytest.raises(InputError, match=r"step_00000002.pt.*free disk space"):
-            save_checkpoint(tmp_path, 2, state(count=1_000_000), keep=1)
-        with pytest.raises(InputError, match="free disk space"):
-            save_weights(tmp_path / "m.safetensors", weights)
+        expect_error("step_00000002.pt", lambda: save_checkpoint(tmp_path, 2, state(count=1_000_000), keep=1))
+        expect_error("free disk space", save_weights, tmp_path / "m.safetensors", weights)
     found = load_latest(tmp_path)
     assert found is not None and found[1]["step"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["step_00000001.pt"]
@@ -109,5 +108,4 @@ def test_only_the_newest_checkpoints_are_kept(tmp_path: Path) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     torch.save({"state_dict": {}}, tmp_path / "other.pt")
-    with pytest.raises(InputError, match="needed a checkpoint of pansplat-train"):
-        load_checkpoint(tmp_path / "other.pt")
+    expect_error("needed a checkpoint of pansplat-train", load_checkpoint, tmp_path / "other.pt")

@@ -34,11 +34,7 @@ def assert_equal_gradients(found: dict[str, torch.Tensor], expected: dict[str, t
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("style", "mixing"),
-    [
-        ("cubemap", "by_view"),
-        pytest.param("panorama", "joint", marks=pytest.mark.exhaustive),
-    ],
+    ("style", "mixing"), [("cubemap", "by_view"), pytest.param("panorama", "joint", marks=pytest.mark.exhaustive)]
 )
 def test_deferred_gradients_equal_plain_ones(style: str, mixing: str, micro: Callable, make_batch: Callable) -> None:
     network, batch = micro(), make_batch()

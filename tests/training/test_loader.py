@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import expect_error
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
@@ -87,7 +88,5 @@ def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) ->
 
 
 def test_empty_sources_and_batches_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="empty source"):
-        Loader(TripletSource(()), height=8, batch_size=1)
-    with pytest.raises(InputError, match="batch_size >= 1"):
-        Loader(_triplets(tmp_path, 1), height=8, batch_size=0)
+    expect_error("empty source", lambda: Loader(TripletSource(()), height=8, batch_size=1))
+    expect_error("batch_size >= 1", lambda: Loader(_triplets(tmp_path, 1), height=8, batch_size=0))

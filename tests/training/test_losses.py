@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import expect_error
 from torch import Tensor
 
-from pansplat.errors import InputError
 from pansplat.training.losses import (
     CODE,
     PAPER,
@@ -127,8 +127,7 @@ def test_auto_selects_lpips_if_its_files_exist_and_structure_otherwise(
     assert choose_perceptual("auto").name == "structure"
     assert choose_perceptual("auto", shared / "weights").name == "lpips-squeeze"
     assert choose_perceptual("structure", shared / "weights").name == "structure"
-    with pytest.raises(InputError, match="LPIPS with vgg needed"):
-        choose_perceptual("lpips-vgg")
+    expect_error("LPIPS with vgg needed", choose_perceptual, "lpips-vgg")
 
 
 # Depth

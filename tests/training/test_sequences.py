@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.training.sequences import BoundedSampler, FramePair, read_loc360
 from pansplat.training.sources import FixedFramePairs, RandomFramePairs
 
@@ -34,8 +34,7 @@ def test_gaps_are_limited_by_the_length_of_the_sequence() -> None:
     sampler = BoundedSampler(2, 30)
     assert sampler.training(2, np.random.default_rng(0)).right == 1
     assert sampler.evaluation(5, 1) == [FramePair(0, 4, (0, 1, 2, 3, 4))]
-    with pytest.raises(InputError, match="two or more posed frames, got 1"):
-        sampler.evaluation(1)
+    expect_error("two or more posed frames, got 1", sampler.evaluation, 1)
 
 
 @pytest.fixture
@@ -56,8 +55,7 @@ def test_360loc_has_separate_locations_for_training_and_validation(tmp_path: Pat
     sequences = read_loc360(tmp_path, "train")
     names = [sequence.name for sequence in sequences]
     assert names == ["concourse-daytime_360_0", "hall-daytime_360_0", "hall-night_360_1", "piatrium-daytime_360_0"]
-    with pytest.raises(InputError, match=r"atrium: needed 360Loc sequences .* for val, got none"):
-        read_loc360(tmp_path, "val")
+    expect_error(r"atrium: needed 360Loc sequences .* for val, got none", read_loc360, tmp_path, "val")
     source = RandomFramePairs(sequences, BoundedSampler(2, 5), draws=10)
     assert len(source) == 40
     first, again = source.sample(3, 8, 7), source.sample(3, 8, 7)

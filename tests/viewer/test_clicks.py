@@ -34,11 +34,7 @@ from pansplat.tours.graph import find_tours
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
-from pansplat_viewer.scene.loader import (
-    LoadedScene,
-    SceneEntry,
-    SceneLoader,
-)
+from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.settings import Display, DrawSettings
 from pansplat_viewer.scene.state import ViewerState
@@ -57,7 +53,7 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
-    "min. opacity", "field of view",
+    "field of view",
     "2##panorama", "##flight",
 )  # fmt: skip
 INITIAL_SETTINGS = {
@@ -69,7 +65,7 @@ OTHER_WIDGETS = {
     "pair", "path", "Open", "Reload", "Photographs", "1##panorama", "Fly",
     "Notes", "note", "Put at the middle", "Remove",
     "Film", "PNG", "EXR + depth", "360 PNG", "Add key frame", "time", "path file", "Save", "Load",
-    "Expert", "orbit", "speed", *get_args(Display), "background", "coarser while moving",
+    "Expert", "orbit", "speed", *get_args(Display), "background",
     "photographs at panoramas",
 }  # fmt: skip
 
@@ -234,10 +230,10 @@ def user(session, ctx) -> User:
     if session.viewer.scenes.names != NAMES or session.viewer.scenes.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
-    kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "adaptive", "message", "message_until")
+    kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "message", "message_until")
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
-    state.camera, state.adaptive, state.message = state.home, True, ""
+    state.camera, state.message = state.home, ""
     state.stops = False  # the camera is at a panorama, and tests look at the scene
     session.viewer.error, session.viewer.stage.resolution.budget_ms = None, BUDGET_MS
     imgui.get_io().add_mouse_pos_event(SIZE[0] - 5, SIZE[1] - 5)
@@ -522,13 +518,10 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     user.draw_frames(8)
-    assert user.viewer.stage.image_size[0] < SIZE[0]
+    assert user.viewer.stage.renderer.stats.size[0] < SIZE[0]
     io.add_key_event(imgui.Key.w, False)
     user.settle()
-    assert user.viewer.stage.image_size == SIZE
-    user.click("coarser while moving")
-    user.press(imgui.Key.w, frames=4)
-    assert user.viewer.stage.image_size == SIZE
+    assert user.viewer.stage.renderer.stats.size == SIZE
 
 
 def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
@@ -545,7 +538,7 @@ def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
     state.camera = replace(state.camera, yaw_radians=state.camera.yaw_radians + 0.3)
     user.settle()
     assert match_photograph(user, 0) < 1, "also in another direction"
-    for change in ({"display": "depth"}, {"opacity_threshold": 0.5}, {"mode": "view"}):
+    for change in ({"display": "depth"}, {"levels": frozenset((0,))}, {"mode": "view"}):
         state.settings = replace(DrawSettings(), **change)
         user.settle()
         assert user.viewer.stage.stop.weight == 0, change

@@ -583,8 +583,7 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
     app.load = load
     app.scenes.show([SceneEntry(house.name, tour=house)], 0)
     app.until(
-        lambda: app.scenes.tour is not None and (app.scenes.tour.tour.poor or app.scenes.tour.tour.walls),
-        "edges",
+        lambda: app.scenes.tour is not None and (app.scenes.tour.tour.poor or app.scenes.tour.tour.walls), "edges"
     )
     tour, edges = app.scenes.tour, app.scenes.tour.tour
     go.set()

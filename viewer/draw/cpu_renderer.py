@@ -38,8 +38,7 @@ from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.system.devices import say_detail
-from pansplat_viewer.draw.color_maps import map_values
-from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
 from pansplat_viewer.draw.splats import Splats, drop_not_finite
@@ -73,7 +72,6 @@ class _Groups:
 
     labels: Int[np.ndarray, "n"]  # layer of each Gaussian, or `NO_LAYER`
     weights: Float[np.ndarray, "layer"]  # of the layers
-    visible: int  # number of Gaussians in all layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +117,7 @@ class CpuRenderer:
             ctx: the current context; without one, `render` returns no texture and `read_color` has the image.
             exact: continue behind a transmittance of 2^-10, which 8 bits do not show.
         """
-        self.stats = FrameStats(renderer="cpu")
+        self.stats = FrameStats()
         self._ctx = ctx
         self._min_transmittance = EXACT_TRANSMITTANCE if exact else MIN_TRANSMITTANCE
         self._worker: BackgroundWorker[_Picture | None] = BackgroundWorker("cpu-renderer")
@@ -127,7 +125,7 @@ class CpuRenderer:
         self._splats: Splats | None = None
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
-        self._groups: dict[Hashable, tuple[Int[np.ndarray, "n"], int]] = {}
+        self._groups: dict[Hashable, Int[np.ndarray, "n"]] = {}
         self._selected = SelectionCache()
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
@@ -161,7 +159,7 @@ class CpuRenderer:
         self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
-        self.stats = FrameStats(total=len(splats), renderer="cpu")
+        self.stats = FrameStats(total=len(splats))
 
     def render(
         self,
@@ -273,16 +271,15 @@ class CpuRenderer:
         splats, settings = self._splats, frame.settings
         layer_weights = choose_layer_weights(frame, splats, _MIN_WEIGHT)
         views = tuple(layer_weights)
-        key = (views, settings.selection)
+        key = (views, settings.levels)
         if key not in self._groups:
             if len(self._groups) >= _MAX_SELECTIONS:
                 self._groups.clear()
             labels = np.full(len(splats), NO_LAYER, np.int16)
             for layer, view in enumerate(views):
-                labels[splats.select(settings.selection, view)] = layer
-            self._groups[key] = labels, int(np.count_nonzero(labels != NO_LAYER))
-        labels, visible = self._groups[key]
-        return _Groups(labels, np.array(list(layer_weights.values()), np.float32), visible)
+                labels[splats.select(settings.levels, view)] = layer
+            self._groups[key] = labels
+        return _Groups(self._groups[key], np.array(list(layer_weights.values()), np.float32))
 
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
@@ -298,7 +295,7 @@ class CpuRenderer:
         stages["blend"] = 1e3 * (time.perf_counter() - before)
         pixels = _enlarge(frame, pixels, stages)
         now = time.perf_counter()
-        stats = self._make_stats(frame, groups, drawn, 1e3 * (now - start), stages)
+        stats = self._make_stats(frame, drawn, 1e3 * (now - start), stages)
         return _Picture(frame, pixels, groups, sums, stats)
 
     def _rasterize(
@@ -328,10 +325,7 @@ class CpuRenderer:
         if name == "color":
             return scene
         if self._colored is None or self._colored[0] != name:
-            cameras = splats.view_positions - splats.origin
-            arrays = scene.means, scene.quats, scene.scales, splats.levels, splats.views, cameras
-            colors = color_by_property(name, *arrays)
-            self._colored = name, scene.with_colors(colors)
+            self._colored = name, scene.with_colors(color_by_label(getattr(splats, name)))
         return self._colored[1]
 
     def _read_from_faces(self, frame: Frame, groups: _Groups) -> _Picture:
@@ -354,7 +348,7 @@ class CpuRenderer:
         stored.faces.sample(frame.rotation, frame.focal, pixels, bottom_up=True)
         stages["sample"] = 1e3 * (time.perf_counter() - before)
         pixels = _enlarge(frame, pixels, stages)
-        stats = self._make_stats(frame, groups, drawn, 1e3 * (time.perf_counter() - start), stages)
+        stats = self._make_stats(frame, drawn, 1e3 * (time.perf_counter() - start), stages)
         return _Picture(frame, pixels, None, None, replace(stats, cached=not missing))
 
     def _draw_face(self, frame: Frame, stored: _FaceSet, face: int) -> int:
@@ -378,16 +372,12 @@ class CpuRenderer:
 
     # --- results ---
 
-    def _make_stats(
-        self, frame: Frame, groups: _Groups, drawn: int, frame_ms: float, stages: dict[str, float]
-    ) -> FrameStats:
+    def _make_stats(self, frame: Frame, drawn: int, frame_ms: float, stages: dict[str, float]) -> FrameStats:
         return FrameStats(
             total=self.stats.total,
-            visible=groups.visible,
             drawn=drawn,
             sort_ms=stages.get("sort", 0.0),
             frame_ms=frame_ms,
-            renderer="cpu",
             stages=stages,
             size=frame.size,
         )

@@ -139,7 +139,6 @@ class Layer:
     """The premultiplied image of one set of Gaussians, and the work that it took in this frame."""
 
     target: Target
-    visible: int  # number of Gaussians in the set
     drawn: int  # number of splats drawn for this frame
     cached: bool  # whether all parts in view were valid before
 
@@ -175,14 +174,14 @@ class LayerPainter:
             target.framebuffer.viewport = place
             drawn += self.rasterizer.draw(cameras[part], place, splats, selected, frame.settings)
         target.parts.update(missing)
-        return Layer(target, int(np.count_nonzero(selected)), drawn, cached=not missing)
+        return Layer(target, drawn, cached=not missing)
 
     def release(self) -> None:
         """Free the splats on the GPU."""
         self.rasterizer.release()
 
     def _select(self, settings: DrawSettings, view: int | None) -> Bool[np.ndarray, "n"]:
-        key = (settings.selection, view)
+        key = (settings.levels, view)
         if key not in self._selections:
             if len(self._selections) > _MAX_SELECTIONS:
                 self._selections.clear()

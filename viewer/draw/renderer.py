@@ -196,7 +196,6 @@ class SplatRenderer:
         self._targets.trim()
         self.stats = FrameStats(
             total=len(splats.splats),
-            visible=sum(layer.visible for layer in layers),
             drawn=sum(layer.drawn for layer in layers),
             sort_ms=splats.milliseconds,
             cached=all(layer.cached for layer in layers),

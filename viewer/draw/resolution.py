@@ -29,13 +29,13 @@ class AdaptiveResolution:
     turn_ms: float = BUDGET_MS  # time of a frame at full resolution above which turns read cached faces
     num_scales: int = len(SCALES)  # how many of SCALES may be used, from the largest on
 
-    def plan(self, now: float, *, moved: bool, turned: bool, adaptive: bool = True) -> ResolutionPlan:
+    def plan(self, now: float, *, moved: bool, turned: bool) -> ResolutionPlan:
         """Return the plan of the frame at time `now` (seconds) after the camera moved, turned or did neither."""
         if moved or turned:
             self.last_motion, self.translated = now, moved
         self.step = min(self.step, self.num_scales - 1)
         moving = now - self.last_motion < self.settle_after
-        if not adaptive or not moving:
+        if not moving:
             return ResolutionPlan(1.0, cached=False, moving=moving)
         slow = self.full_ms > min(self.turn_ms, self.budget_ms)
         return ResolutionPlan(SCALES[self.step], cached=slow and not self.translated, moving=True)

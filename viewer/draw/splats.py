@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,9 +21,8 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
 from pansplat.rendering.cpu.runtime import parallel_for_slices
 from pansplat.rendering.cpu.tiling import radix_argsort
-from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.draw.color_maps import color_by_label
 from pansplat_viewer.scene.camera import Pinhole
-from pansplat_viewer.scene.settings import GaussianChoice
 
 # Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
 # which would cost more time than it saves.
@@ -128,19 +128,13 @@ class Splats:
             colors[chunk, :3] = np.maximum(sums, 0).T
         return colors
 
-    def color_by(self, display: str) -> Float[np.ndarray, "n 4"]:
-        """Return the colours of all splats that show a property, and a padding column."""
-        rows = self.geometry
-        cameras = self.view_positions - self.origin
-        colors = color_by_property(display, self.means, rows[:, 4:8], rows[:, 8:11], self.levels, self.views, cameras)
-        return np.pad(colors, ((0, 0), (0, 1)))
+    def color_by(self, display: Literal["levels", "views"]) -> Float[np.ndarray, "n 4"]:
+        """Return the colours of all splats that show a label, and a padding column."""
+        return np.pad(color_by_label(getattr(self, display)), ((0, 0), (0, 1)))
 
-    def select(self, selection: GaussianChoice, view: int | None) -> Bool[np.ndarray, "n"]:
-        """Return a mask of the splats that a selection and view contain and that can be visible."""
-        levels, threshold = selection
+    def select(self, levels: frozenset[int] | None, view: int | None) -> Bool[np.ndarray, "n"]:
+        """Return a mask of the splats of levels and a view, None for all, that can be visible."""
         selected = self.reach > 0
-        if threshold > 0:
-            selected &= self.opacities >= np.float32(threshold)
         if levels is not None:
             selected &= np.isin(self.levels, list(levels))
         if view is not None:

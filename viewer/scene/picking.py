@@ -80,7 +80,7 @@ def pick_point(
 
 def _select(scene: Scene, settings: DrawSettings) -> Bool[np.ndarray, "n"]:
     gaussians = scene.gaussians
-    selected = gaussians.opacities.numpy() >= settings.opacity_threshold
+    selected = np.ones(len(gaussians), bool)
     if settings.levels is not None:
         selected &= np.isin(gaussians.levels.numpy(), list(settings.levels))
     if settings.mode == "view":

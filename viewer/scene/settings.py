@@ -13,10 +13,7 @@ from pansplat.errors import InputError
 Mode = Literal["joint", "view", "deferred"]
 Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
-Display = Literal["color", "depth", "opacity", "normals", "levels", "views"]
-
-GaussianChoice = tuple[frozenset[int] | None, float]
-"""Levels and least opacity of the Gaussians that are drawn."""
+Display = Literal["color", "depth", "opacity", "levels", "views"]
 
 _CHOICES = {
     "mode": Mode,
@@ -34,8 +31,7 @@ class DrawSettings:
     Attributes:
         mode: `joint` draws all Gaussians together. `view` draws those of one context view. `deferred` draws each
             context view separately and blends the images per pixel by distance.
-        display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `normals`, the shortest
-            axes of the Gaussians, towards their camera, with 0.5 + 0.5 (x, y, z) of the world as RGB; `levels` and
+        display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `levels` and
             `views`, a colour for each label.
         display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
@@ -48,7 +44,6 @@ class DrawSettings:
     mode: Mode = "joint"
     view: int = 0  # the context view of mode `view`
     levels: frozenset[int] | None = None  # pyramid levels to draw; None draws all
-    opacity_threshold: float = 0.0  # Gaussians of lower opacity are not drawn
     display: Display = "color"
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
@@ -76,19 +71,14 @@ class DrawSettings:
             raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
 
     @property
-    def selection(self) -> GaussianChoice:
-        """What chooses the Gaussians that are drawn, besides the view."""
-        return self.levels, self.opacity_threshold
-
-    @property
     def shows_scene(self) -> bool:
         """Whether the colours of the whole scene are shown."""
-        return self.selection == (None, 0.0) and self.display == "color" and self.mode != "view"
+        return self.levels is None and self.display == "color" and self.mode != "view"
 
     @property
-    def splat_colors(self) -> Literal["color", "normals", "levels", "views"]:
+    def splat_colors(self) -> Literal["color", "levels", "views"]:
         """The colours of the Gaussians."""
-        return self.display if self.display in ("normals", "levels", "views") else "color"
+        return self.display if self.display in ("levels", "views") else "color"
 
 
 @dataclass(frozen=True)
@@ -96,7 +86,6 @@ class FrameStats:
     """Counts and times of the last frame.
 
     Attributes:
-        visible: Gaussians selected by view, level and opacity threshold; in mode `deferred`, summed over the views.
         drawn: splats sent to the GPU for this frame after culling, summed over faces and views; 0 if all layers
             were cached.
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
@@ -109,12 +98,10 @@ class FrameStats:
     """
 
     total: int = 0  # Gaussians of the scene on the GPU
-    visible: int = 0
     drawn: int = 0
     sort_ms: float = 0.0
     frame_ms: float = 0.0
     timed: DrawSettings | None = None
-    renderer: Literal["gl", "cpu"] = "gl"
     cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)

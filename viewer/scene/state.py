@@ -49,7 +49,6 @@ class ViewerState:
     overlay: bool = True
     help: bool = False
     stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
-    adaptive: bool = True  # whether the resolution is lowered while the camera moves
     speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     num_views: int = 0  # number of input cameras of the scene that is shown

@@ -1,4 +1,4 @@
-"""Text and marks over the image, without controls: statistics, picked points, hotspots, messages and colour maps."""
+"""Text and marks over the image, without controls: picked points, hotspots, messages and colour maps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.scene.hotspots import Hotspot
 from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.scene.settings import SCALAR_MAPS, FrameStats
+from pansplat_viewer.scene.settings import SCALAR_MAPS
 from pansplat_viewer.scene.state import ViewerState
 
 PANEL_WIDTH = 290.0  # of the main panel at first, pixels at a DPI scale of 1
@@ -28,30 +28,6 @@ _LABEL = (
 _LEGEND_WIDTH = 180.0
 FADE_COLOR = (1.0, 0.75, 0.3)  # of panoramas of other parts of a tour
 UNITS = {"depth": " m"}  # of displays whose range can be changed
-
-
-def draw_stats(state: ViewerState, stats: FrameStats, frame_ms: float, image_size: tuple[int, int]) -> None:
-    """Draw times, counts and the camera's position at the top right.
-
-    Args:
-        state: has the camera.
-        stats: of the last image.
-        frame_ms: time of a whole frame.
-        image_size: (width, height), pixels.
-    """
-    size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
-    if size.x > 2.2 * PANEL_WIDTH * scale:
-        imgui.set_next_window_pos((size.x - MARGIN, MARGIN), 0, (1.0, 0.0))
-    else:  # too narrow next to the main panel: bottom right
-        imgui.set_next_window_pos((size.x - MARGIN, size.y - MARGIN), 0, (1.0, 1.0))
-    x, y, z = state.camera.position
-    lines = [
-        f"frame {frame_ms:.1f} ms   draw {stats.frame_ms:.1f} ms   sort {stats.sort_ms:.0f} ms",
-        f"{stats.drawn:,} drawn of {stats.visible:,} of {stats.total:,}",
-        f"{image_size[0]} x {image_size[1]}   {stats.renderer}" + ("   cached" if stats.cached else ""),
-        f"x {x:.2f}  y {y:.2f}  z {z:.2f} m",
-    ]
-    _draw_label("##stats", lines, alpha=0.6)
 
 
 def draw_points(state: ViewerState) -> None:
@@ -91,14 +67,9 @@ def draw_message(message: str) -> None:
     """Draw a text at the bottom."""
     size = imgui.get_io().display_size
     imgui.set_next_window_pos((size.x / 2, size.y - 2 * MARGIN), 0, (0.5, 1.0))
-    _draw_label("##message", [message], alpha=0.75)
-
-
-def _draw_label(name: str, lines: list[str], alpha: float) -> None:
-    imgui.set_next_window_bg_alpha(alpha)
-    imgui.begin(name, None, _LABEL)
-    for line in lines:
-        imgui.text_unformatted(line)
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin("##message", None, _LABEL)
+    imgui.text_unformatted(message)
     imgui.end()
 
 

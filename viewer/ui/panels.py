@@ -38,7 +38,6 @@ from pansplat_viewer.ui.overlays import (
     draw_legend,
     draw_message,
     draw_points,
-    draw_stats,
 )
 from pansplat_viewer.ui.placing import PlacingWindow, draw_photographs
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
@@ -66,7 +65,6 @@ class Panels:
         self.minimap, self.placing = Minimap(), PlacingWindow(ctx, self.widgets)
         self.notes = NotesSection(self.widgets)
         self.path, self.path_file = "", "path.json"
-        self._is_expert = False  # whether the group "Expert" is open
 
     def draw(self, viewer: Viewer) -> None:
         """Draw the panels that are shown."""
@@ -74,8 +72,6 @@ class Panels:
         state, stats, placing = viewer.state, viewer.stage.renderer.stats, viewer.placing
         if state.overlay:
             self._draw_main_panel(viewer)
-            if stats.total and self._is_expert:
-                draw_stats(state, stats, viewer.frame_ms, viewer.stage.image_size)
         if stats.total:
             draw_legend(state)
         if state.overlay and state.points:
@@ -121,7 +117,7 @@ class Panels:
         if viewer.scenes.notes or len(viewer.stage.photographs):
             section("Notes", partial(self._draw_notes, viewer))
         section("Film", partial(self._draw_film, viewer))
-        self._is_expert = section("Expert", partial(self._draw_expert, viewer), opened=False)
+        section("Expert", partial(self._draw_expert, viewer), opened=False)
 
     def _draw_photographs(self, viewer: Viewer) -> None:
         """Draw where the camera can go, and the states of estimated poses."""
@@ -243,8 +239,7 @@ class Panels:
                 else:
                     shown.discard(level)
             settings = replace(settings, levels=None if shown == set(state.levels) else frozenset(shown))
-        threshold = self.widgets.slider("min. opacity", settings.opacity_threshold, 0.0, 1.0, "%.2f")
-        state.settings = replace(settings, opacity_threshold=threshold)
+        state.settings = settings
 
     def _draw_settings(self, viewer: Viewer) -> None:
         state, settings = viewer.state, viewer.state.settings
@@ -254,7 +249,6 @@ class Panels:
         if changed:
             settings = replace(settings, background=(background[0], background[1], background[2]))
         state.settings = settings
-        state.adaptive = self.widgets.check("coarser while moving", state.adaptive)
         state.stops = self.widgets.check("photographs at panoramas", state.stops)
 
     def _draw_camera(self, viewer: Viewer) -> None:

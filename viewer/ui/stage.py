@@ -41,7 +41,6 @@ class Stage:
         photographs: of the scene.
         resolution: of the frames.
         size: of the window, pixels.
-        image_size: of the rendered image, pixels; smaller than the window while the camera moves.
         has_failed: whether drawing has failed; nothing is drawn until this is False.
         last_camera: of the last frame; a change since then is a movement.
     """
@@ -64,7 +63,6 @@ class Stage:
         self._stop_camera = state.camera  # of the last frame before a cut
         self.resolution = self._create_resolution()
         self.size: tuple[int, int] = (1, 1)
-        self.image_size: tuple[int, int] = (1, 1)
         self.has_failed = False
         self.last_camera = state.camera
 
@@ -210,7 +208,6 @@ class Stage:
             else:
                 self.presenter.draw_photograph(photograph, target, state.camera)
             return
-        self.image_size = self.size if self.photograph is not None else self.renderer.stats.size
         self.presenter.draw(image, target, fading=fading, weight=weight)
 
     def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
@@ -246,7 +243,7 @@ class Stage:
         turned = not moved and camera != self.last_camera
         self.last_camera = camera
         self.resolution.limit(self.size, self.renderer.pacing.min_size)
-        return self.resolution.plan(self._state.now, moved=moved, turned=turned, adaptive=self._state.adaptive)
+        return self.resolution.plan(self._state.now, moved=moved, turned=turned)
 
     def _record_time(self, plan: ResolutionPlan, milliseconds: float) -> None:
         if milliseconds > 0:  # else the image is not new, or not finished

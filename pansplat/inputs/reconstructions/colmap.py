@@ -36,7 +36,7 @@ _MODELS = (  # by number: name and count of parameters
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
     ("EUCM", 6), ("EQUIRECTANGULAR", 2),
 )  # fmt: skip
-_FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "PINHOLE": 2, "OPENCV": 2, "FULL_OPENCV": 2}
+_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
 _MAX_BYTES = 1 << 31  # of a file
 _MAX_POINTS = 200_000  # that are read, for near and far
 _MAX_NAME = 4096  # bytes
@@ -102,9 +102,9 @@ def _make_lens(camera: _Camera, where: str) -> Lens | None:
     if model == "EQUIRECTANGULAR":
         return None
     focals = _FOCALS.get(model)
-    if focals is None or any(parameters[focals + 2 :]):
+    if focals is None:
         raise InputError(
-            f"{where}: needed an equirectangular camera, or a pinhole camera without distortion, got {model}; "
+            f"{where}: needed an equirectangular or a pinhole camera without distortion, got {model}; "
             "undistort the pictures first (colmap image_undistorter)."
         )
     fx, fy, (cx, cy) = parameters[0], parameters[focals - 1], parameters[focals : focals + 2]

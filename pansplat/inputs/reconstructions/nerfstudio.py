@@ -10,7 +10,6 @@ nerfstudio.data.dataparsers.nerfstudio_dataparser, nerfstudio.cameras.cameras (`
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -44,7 +43,6 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _SIDE, _FOCAL = Annotated[float, Meta(ge=1, le=1 << 20)], Annotated[float, Meta(ge=1e-6, le=1e9)]
 _LENS = {
     "w": _SIDE, "h": _SIDE, "fl_x": _FOCAL, "fl_y": _FOCAL, **dict.fromkeys(("cx", "cy", *_DISTORTION), float),
-    "camera_angle_x": Annotated[float, Meta(ge=1e-6, le=math.pi - 1e-6)],
 }  # fmt: skip
 _PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -98,9 +96,8 @@ def _read_lens(fields: Mapping[str, Any], image: Path, where: str) -> Lens | Non
             "(colmap image_undistorter)."
         )
     width, height = (int(numbers[key] or size) for key, size in zip(("w", "h"), read_size(image), strict=True))
-    if numbers["fl_x"] is None and numbers["camera_angle_x"] is None:
-        raise InputError(f'{where}: needed a focal length ("fl_x") or "camera_angle_x", got neither; add one.')
-    fx = numbers["fl_x"] or width / 2 / math.tan(numbers["camera_angle_x"] / 2)
+    if (fx := numbers["fl_x"]) is None:
+        raise InputError(f'{where}: needed a focal length as "fl_x", pixels, got none; add it.')
     cx, cy = (size / 2 if numbers[key] is None else numbers[key] for key, size in (("cx", width), ("cy", height)))
     return Lens(fx, numbers["fl_y"] or fx, cx, cy, width, height)
 
@@ -111,26 +108,18 @@ def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "poin
     path = locate_inside(source.parent, name, source) if isinstance(name, str) else None
     if path is None or not path.is_file():
         return np.empty((0, 3))
-    data = read_file(path, limit=_MAX_PLY)
-    end = data.find(b"end_header\n")
-    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
-    counts = [int(line[2]) for line in lines if line[:2] == ["element", "vertex"] and line[2].isdecimal()]
-    names = [(line[2], _PLY_TYPES.get(line[1], "")) for line in lines if line[:1] == ["property"] and len(line) == 3]
-    formats = [line[1] for line in lines if line[:1] == ["format"] and len(line) > 1]
-    columns = [name for name, _ in names]
-    if end < 0 or not counts or not formats or not {"x", "y", "z"} <= set(columns):
-        return np.empty((0, 3))
-    body = data[end + len(b"end_header\n") :]
+    head, _, body = read_file(path, limit=_MAX_PLY).partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    columns = [(line[2], "<" + _PLY_TYPES.get(line[1], "")) for line in lines if line[:1] == ["property"]]
     try:
-        if formats[0] == "ascii":
-            rows = body.decode("ascii").split("\n")[: counts[0]]
-            values = np.array([row.split() for row in rows], np.float64)
-            points = values[:, [columns.index(axis) for axis in "xyz"]]
+        count = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
+        if ["format", "ascii", "1.0"] in lines:
+            rows = np.array([row.split() for row in body.decode("ascii").split("\n")[:count]], np.float64)
+            table: Any = dict(zip([name for name, _ in columns], rows.T, strict=True))
         else:
-            order = ">" if formats[0] == "binary_big_endian" else "<"
-            table = np.frombuffer(body, np.dtype([(name, order + kind) for name, kind in names]), counts[0])
-            points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    except (ValueError, TypeError, IndexError):
+            table = np.frombuffer(body, np.dtype(columns), count)
+        points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except (ValueError, TypeError, IndexError, KeyError, StopIteration):
         return np.empty((0, 3))
     return points[np.isfinite(points).all(axis=1)]
 

@@ -5,8 +5,8 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.inputs.web_tours.javascript import parse_literal
 
 _JSON = st.recursive(
@@ -72,5 +72,4 @@ def test_code_is_skipped(code: str) -> None:
     ],
 )
 def test_damaged_text_is_refused(text: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"tour.html: needed {message}"):
-        parse(text)
+    expect_error(f"tour.html: needed {message}", parse, text)

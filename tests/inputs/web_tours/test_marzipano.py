@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import expect_error
 
 from pansplat.cli import run
-from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.inputs.pairs import Link, Note, Panorama
@@ -85,8 +85,7 @@ def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, 
 
 def test_messages_name_rooms_by_their_titles(export: Export) -> None:
     folder = export(_scene("0-hall", name="Entrance"), _scene("1-kitchen"))
-    with pytest.raises(InputError, match=r"got images only \(Entrance, Kitchen\)"):
-        load_pairs(folder)
+    expect_error(r"got images only \(Entrance, Kitchen\)", load_pairs, folder)
     assert [_describe(view, folder) for view in load_panoramas(folder)] == [f"{folder}: Entrance", f"{folder}: Kitchen"]
 
 
@@ -253,7 +252,6 @@ def test_tiles_outside_of_the_folder_are_not_read(export: Export, key: str) -> N
     [
         ({"id": None}, 'number 2\' is left out: needed an "id"'),
         ({"levels": None}, "needed all tiles of a level"),
-        ({"levels": [{"size": "big"}]}, "size: needed a whole number, got 'big'"),
         ({"levels": [{"size": 64, "tileSize": 0}]}, "tileSize: needed a whole number >= 1, got 0"),
     ],
 )

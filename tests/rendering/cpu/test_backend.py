@@ -70,7 +70,7 @@ def test_other_kernels_and_channels_are_refused(scene, pose):
     gray = dataclasses.replace(scene, harmonics=scene.harmonics[..., :1])
     assert _select_backend("auto", gray, "ray") is reference.rasterize_planes
     for given, kernel in ((scene, "ewa"), (gray, "ray")):
-        with pytest.raises(InputError, match=f"got kernel '{kernel}' and . channels; use backend='torch'"):
+        with pytest.raises(InputError, match=f"kernel '{kernel}' and . channels"):
             rasterize(given, pose, size=(8, 16), layout="cubemap", kernel=kernel, backend="numba")
 
 

@@ -11,8 +11,7 @@ from PIL import Image
 
 from pansplat.images.image_files import write_image
 from pansplat.rendering import rasterize
-from pansplat_viewer.draw.color_maps import map_values
-from pansplat_viewer.draw.displays import color_by_property
+from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import render_image
 from pansplat_viewer.scene.settings import SCALAR_MAPS, Display, DrawSettings, Mode
 
@@ -39,25 +38,9 @@ def test_depth_and_opacity_are_the_mapped_numbers_of_the_image(make_renderer, sm
         assert (np.abs(color[..., :3] - expected).max(axis=2) > 0.03).mean() < 0.01
 
 
-def test_normals_point_to_the_camera_of_their_view():
-    colors = color_by_property(
-        "normals",
-        means=np.array(((0, 0, 2), (0, 0, 2)), np.float32),
-        quats=np.array(((1, 0, 0, 0), (1, 0, 0, 0)), np.float32),
-        scales=np.array(((1, 1, 0.1), (1, 1, 0.1)), np.float32),
-        levels=np.zeros(2, np.int32),
-        views=np.array((0, 1), np.int32),
-        view_positions=np.array(((0, 0, 0), (0, 0, 5.0))),
-    )
-    assert np.allclose(colors, ((0.5, 0.5, 0), (0.5, 0.5, 1)))
-
-
 def test_labels_have_ten_different_colors():
-    labels = np.arange(11, dtype=np.int32)
-    nothing = np.zeros((11, 3), np.float32)
-    for display in ("levels", "views"):
-        colors = color_by_property(display, nothing, nothing, nothing, labels, labels, nothing)
-        assert len(np.unique(colors, axis=0)) == 10 and np.array_equal(colors[10], colors[0])
+    colors = color_by_label(np.arange(11, dtype=np.int32))
+    assert len(np.unique(colors, axis=0)) == 10 and np.array_equal(colors[10], colors[0])
 
 
 GOLDEN = Path(__file__).parents[2] / "assets" / "viewer.png"  # PANSPLAT_WRITE_GOLDEN=1 writes it

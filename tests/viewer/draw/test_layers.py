@@ -69,7 +69,7 @@ def test_narrow_field_of_view_is_drawn_directly(make_renderer, random_scene, pos
 def test_kept_layers_follow_every_setting(make_renderer, random_scene, pose):
     scene = random_scene(size=0.1)
     renderer, fresh = make_renderer(scene), make_renderer(scene, slot=1)
-    changes = {"mode": "view", "levels": frozenset({1, 2}), "opacity_threshold": 0.5, "near": 1.9}
+    changes = {"mode": "view", "levels": frozenset({1, 2}), "near": 1.9}
     for (name, value), settings in itertools.product(changes.items(), STORAGES):
         before = render_image(renderer, pose, settings)
         changed = replace(settings, **{name: value})
@@ -161,7 +161,7 @@ def test_splats_in_chunks_are_the_image_of_one_chunk_and_no_splat_is_none(ctx, r
         renderer.upload(random_scene())
         images.append(render_image(renderer, pose, DrawSettings()))
         assert renderer.stats.drawn > 60, "more than three chunks"
-        nothing = render_image(renderer, pose, DrawSettings(opacity_threshold=1.0))
+        nothing = render_image(renderer, pose, DrawSettings(levels=frozenset()))
         assert renderer.stats.drawn == 0 and not nothing.any()
         renderer.release()
     assert images[0].max() > 0.4 and np.array_equal(*images)

@@ -12,8 +12,8 @@ import moderngl
 import numpy as np
 import pytest
 import torch
+from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat_viewer.draw import offscreen
 from pansplat_viewer.draw.renderer import DrawSettings
 
@@ -88,10 +88,8 @@ def test_old_opengl_and_osmesa_render_the_same_images(make_renderer, random_scen
 def test_missing_opengl_is_reported_with_the_packages(monkeypatch):
     monkeypatch.setattr(moderngl, "create_context", Mock(side_effect=Exception("libEGL not loaded")))
     monkeypatch.setattr(offscreen, "_load_osmesa", Mock(side_effect=OSError("libOSMesa is not installed")))
-    with pytest.raises(InputError, match=r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6"):
-        offscreen.create_context()
-    with pytest.raises(InputError, match="auto, egl, osmesa or system, got 'wgl'"):
-        offscreen.create_context("wgl")
+    expect_error(r"libEGL not loaded.*libOSMesa.*apt-get install libegl1.*libosmesa6", offscreen.create_context)
+    expect_error("auto, egl, osmesa or system, got 'wgl'", offscreen.create_context, "wgl")
 
 
 @pytest.mark.parametrize("system", ["win32", "darwin"])
@@ -110,8 +108,7 @@ def test_windows_and_macos_have_contexts_of_their_own(monkeypatch, system):
     monkeypatch.setattr(moderngl, "create_context", create)
     assert offscreen.create_context().version_code == offered
     offered = 110  # "GDI Generic": no driver is installed
-    with pytest.raises(InputError, match=r"system: Requested .*got version 110\); install the driver of the graphics"):
-        offscreen.create_context()
+    expect_error(r"system: Requested .*got version 110\); install the driver of the graphics", offscreen.create_context)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not available for this system")

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import expect_error
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputWarning
 from pansplat.gaussians.ply import save_ply
 from pansplat.geometry.world import WorldFrame
 from pansplat.prediction_options import PredictOptions, ReadOptions
@@ -41,12 +42,10 @@ def test_paths_without_scenes_are_refused(tmp_path):
         (tmp_path / "empty", "empty"),
         (Path("~nobody-has-this-name"), "no such"),
     ):
-        with pytest.raises(InputError, match=message):
-            find_entries(path, ReadOptions(), PredictOptions())
+        expect_error(message, find_entries, path, ReadOptions(), PredictOptions())
     (tmp_path / "scene.ply").write_bytes(b"ply\nnot really")
     (entry,) = find_entries(tmp_path / "scene.ply", ReadOptions(), PredictOptions())
-    with pytest.raises(InputError, match=r"scene\.ply"):
-        load_entry(entry, PredictOptions())
+    expect_error(r"scene\.ply", lambda: load_entry(entry, PredictOptions()))
 
 
 def test_a_folder_of_scenes_has_an_entry_for_each(tmp_path, small_scene):

@@ -44,10 +44,7 @@ def test_depth_is_the_mean_by_weight(scene):
     assert point.position == pytest.approx((0, 0, point.depth))
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [DrawSettings(levels=frozenset((0,))), DrawSettings(mode="view", view=0)],
-)
+@pytest.mark.parametrize("settings", [DrawSettings(levels=frozenset((0,))), DrawSettings(mode="view", view=0)])
 def test_hidden_gaussians_are_not_picked(scene, settings):
     assert pick_point(scene, np.zeros(3), np.array((0.0, 0.0, 1.0)), settings).depth == pytest.approx(2)
 
@@ -57,7 +54,6 @@ def test_nothing_is_picked_behind_the_camera_beside_the_scene_or_too_near(scene)
         assert pick_point(scene, np.zeros(3), np.array(direction), DrawSettings()) is None
     ahead = np.array((0.0, 0.0, 1.0))
     assert pick_point(scene, np.zeros(3), ahead, DrawSettings(near=5.0)) is None
-    assert pick_point(scene, np.zeros(3), ahead, DrawSettings(opacity_threshold=0.95)) is None
 
 
 def test_depths_are_those_of_the_image(random_scene):

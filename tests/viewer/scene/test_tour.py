@@ -247,7 +247,7 @@ def open_tour_film(load_house) -> Iterator[Callable[..., Film]]:
 
         def open_one(scenes: TourScenes, load: Callable = load_house, size: tuple[int, int] = (64, 36)) -> Film:
             first, settings = load_house(scenes.make_entry(scenes.views)), DrawSettings(mode="deferred")
-            settings = replace(settings, opacity_threshold=1e-6)  # without photographs
+            settings = replace(settings, levels=frozenset(range(8)))  # all, but without photographs
             return stack.enter_context(open_film(lambda: CpuRenderer(None), first, scenes, load, size, settings))
 
         yield open_one
