@@ -367,7 +367,7 @@ class Scenes:
     def _list_remaining(self) -> tuple[int, ...]:
         """The panoramas that a flight through a tour still visits; none if there is no flight."""
         route, state = self._state.route, self._state
-        return route.walk[route.leg(state.flight) + 1 :] if route is not None and state.playing else ()
+        return route.list_remaining(state.flight) if route is not None and state.playing else ()
 
     def update(self) -> None:
         """Show the scene of the camera's place, and load those that are next."""
@@ -375,7 +375,7 @@ class Scenes:
         if tour is None:
             return
         route = state.route if state.playing else None
-        tour.move(np.asarray(state.camera.position), None if route is None else route.edge(state.flight))
+        tour.move(np.asarray(state.camera.position), None if state.moment is None else state.moment.step.edge)
         state.tour = tour.tour  # poor edges and walls are found later
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)
@@ -412,11 +412,12 @@ class Scenes:
                 if state.flight == 0:
                     state.route = tour.plan_route(pose)
                 elif not np.allclose(pose, state.route.pose(state.flight), atol=1e-4):
-                    state.route = tour.plan_route(pose, state.route.walk[state.route.leg(state.flight) + 1 :])
+                    state.route = tour.plan_route(pose, state.route.list_remaining(state.flight))
                     state.flight = 0.0
             state.target = None
             if state.playing:  # photographs are read before they are shown
-                leg = state.route.leg(state.flight)
-                for node in state.route.walk[leg + 1 : leg + 3]:
+                for node in state.route.list_remaining(state.flight)[:2]:
                     self._stage.get_photograph(node)
+                if state.moment is not None and state.moment.arrival is not None and self._stage.photographs.is_reading:
+                    return
         advance_flight(state, seconds)
