@@ -262,7 +262,7 @@ class Film:
             moment.weight,
             shot.pose,
             plane,
-            lambda: sum((share * draw() for _, share, draw in drawn), np.float32(0)),
+            lambda: np.sum([share * draw() for _, share, draw in drawn], axis=0),
         )
         if goal is None:
             return image

@@ -118,12 +118,9 @@ class Route:
     @property
     def visits(self) -> dict[int, float]:
         """The fraction of the duration at which the camera comes to rest at a panorama, by panorama."""
-        rests = [
-            (step.nodes[1], end - step.seconds)
-            for step, end in zip(self.steps, self._ends, strict=True)
-            if step.kind == "rest"
-        ]
-        return {node: begin / self.seconds for node, begin in rests if node is not None}
+        begins = zip(self.steps, self._ends - [step.seconds for step in self.steps], strict=True)
+        rests = [(step.nodes[1], begin / self.seconds) for step, begin in begins if step.kind == "rest"]
+        return {node: at for node, at in rests if node is not None}
 
     def _find(self, fraction: float) -> tuple[int, float]:
         """The step at a fraction of the duration, and the eased fraction of it that is done."""
@@ -271,7 +268,9 @@ class _Planner:
             right, _, forward = -(self.level.T @ back)
             return math.atan2(right, forward), 0.0
         is_known = self.tour.worlds[start] == self.tour.worlds[end] or end not in self.outlooks
-        return self.find_start_view(end) or (self.camera[3:] if is_known else find_turned(self.outlooks[end])[1])
+        return self.find_start_view(end) or (
+            self.camera[3:].tolist() if is_known else find_turned(self.outlooks[end])[1]
+        )
 
     def find_start_view(self, node: int) -> tuple[float, float] | None:
         """Yaw and pitch of the view that a visitor of a panorama sees first."""
