@@ -28,7 +28,7 @@ from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
-from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route
+from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
 
 FLIGHT_SECONDS = 4.0  # of the film of a pair
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
@@ -104,7 +104,7 @@ class FilmPhotographs:
     def cover(
         self, index: int | None, weight: float, pose: Pose, plane: ImagePlane, draw: Callable[[], Image]
     ) -> Image:
-        """The image that `draw` returns, with a weight of a photograph over it as a camera at its panorama sees it."""
+        """The image that `draw` returns, with a weight of a photograph over it, as a camera near it sees it."""
         if weight <= 0 or index is None or index >= len(self._poses):
             return draw()
         photograph, shown = self._draw(index, pose, plane)
@@ -115,10 +115,11 @@ class FilmPhotographs:
     def _draw(
         self, index: int, pose: Float[np.ndarray, "4 4"], plane: ImagePlane
     ) -> tuple[Image, Float[np.ndarray, "height width 1"]]:
-        """A photograph as a camera at its panorama sees it, and where it is shown (0 to 1)."""
+        """A photograph as a camera near its panorama sees it, and where it is shown (0 to 1)."""
         height = next((height for height in _HEIGHTS if height * plane.pixel_angle >= np.pi), _HEIGHTS[-1])
         rotation = self._poses[index, :3, :3].T @ torch.as_tensor(pose[:3, :3], dtype=torch.float64)
-        uv = uv_from_directions(plane.directions() @ rotation.T)
+        offset = torch.from_numpy(find_offset(self._poses[index].numpy(), pose[:3, 3]))
+        uv = uv_from_directions(plane.directions() @ rotation.T + offset)
         drawn = sample_equirect(self._load(index, height), uv.float()).permute(1, 2, 0).numpy()
         return drawn[..., :3], drawn[..., 3:]
 

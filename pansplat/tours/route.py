@@ -32,10 +32,8 @@ _LOWEST = -0.2  # radians, the pitch towards a link, which may be on the floor
 _FLIGHT_SECONDS = 1.0, 1.6  # the least and the most of a flight
 _SHORT, _METRE_SECONDS = 2.0, 0.1  # metres of a flight of the least time, and seconds for each further metre
 _NEAR = 1.0  # metres to the first panorama, below which the camera keeps its heading
-_COVERED, _UNCOVERED = (
-    0.05,
-    0.15,
-)  # of a flight, from either end: where the photograph begins to fade, and where it is gone
+_COVERED = 0.1  # of a flight, from either end: there is the photograph, which fades over as much
+_SURFACES, _MOST_BESIDE = 2.5, 0.4  # usual distance of surfaces, metres, and the most of it from a photograph's camera
 
 Kind = Literal["turn", "flight", "zoom", "rest"]
 
@@ -136,7 +134,7 @@ class Route:
             return Moment(step, self._pose(step.start), step.nodes[0], 1.0, self._pose(step.end), part)
         pose = self._pose((1 - part) * step.start + part * step.end)
         end, away = (0, part) if part < 0.5 else (1, 1 - part)
-        weight = ease((_UNCOVERED - away) / (_UNCOVERED - _COVERED)) if step.kind == "flight" else 1.0
+        weight = min(max(2 - away / _COVERED, 0.0), 1.0) if step.kind == "flight" else 1.0
         return Moment(step, pose, step.nodes[end], weight if step.nodes[end] is not None else 0.0)
 
     def pose(self, fraction: float) -> Float[np.ndarray, "4 4"]:
@@ -281,6 +279,12 @@ class _Planner:
 def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
     """Yaw and pitch of a unit direction (right, down, forward)."""
     return math.atan2(direction[0], direction[2]), math.asin(min(max(-float(direction[1]), -1.0), 1.0))
+
+
+def find_offset(pose: Float[np.ndarray, "4 4"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """From a panorama to a camera beside it, in its axes, as a fraction of the usual distance of surfaces."""
+    offset = pose[:3, :3].T @ (position - pose[:3, 3]) / _SURFACES
+    return offset * min(_MOST_BESIDE / max(float(np.linalg.norm(offset)), 1e-9), 1.0)
 
 
 def ease(fraction: float) -> float:

@@ -16,7 +16,7 @@ from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Panorama
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import TourGraph, find_tours
-from pansplat.tours.route import Moment, Route, plan_route
+from pansplat.tours.route import Moment, Route, find_offset, plan_route
 
 
 def _start(tour: TourGraph, node: int, yaw: float = 0.0) -> np.ndarray:
@@ -53,7 +53,7 @@ def test_the_camera_turns_at_the_photograph_flies_ahead_and_arrives_at_the_photo
         part = float((place - ends[0]) @ way)
         assert np.allclose(place, ends[0] + part * way)
         nearest = step.nodes[part > 0.499]
-        expected = 1 if min(part, 1 - part) < 0.05 else 0 if 0.15 < part < 0.85 else moment.weight
+        expected = 1 if min(part, 1 - part) < 0.1 else 0 if 0.2 < part < 0.8 else moment.weight
         assert moment.photograph == nearest and moment.weight == pytest.approx(expected)
         assert np.allclose(moment.pose[:3, 1], (0, 1, 0)), "level"
     for before, after in itertools.pairwise(moments):
@@ -172,6 +172,14 @@ def test_along_a_poor_edge_the_camera_zooms_in_the_direction_of_the_other_panora
     route = plan_route(poor, [0, 1, 4], _start(poor, 0))
     assert [step.kind for step in route.steps] == ["flight", "turn", "zoom", "rest"]
     assert np.allclose(route.at(0.9).pose[:3, 2], (1, 0, 0)) and np.allclose(route.pose(1)[:3, 2], (1, 0, 0))
+
+
+def test_beside_its_panorama_a_photograph_is_seen_as_if_surfaces_were_2_5_metres_away():
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn_axes(np.eye(3), math.pi / 2, 0.0), (1, 2, 3)
+    assert np.allclose(find_offset(pose, np.array((1.5, 2, 3))), (0, 0, 0.2)), "in its axes: it looks to the right"
+    assert np.allclose(find_offset(pose, np.array((9, 2, 3))), (0, 0, 0.4)), "never near the surfaces"
+    assert not find_offset(pose, pose[:3, 3]).any()
 
 
 @pytest.mark.parametrize(("unit", "origin"), [(1e3, (0, 0, 0)), (1.0, (5e6, 4e5, 120)), (1e3, (5e9, 4e8, 1e5))])

@@ -284,8 +284,7 @@ class TourScenes:
         if remaining:
             walk = self._find_way(position, remaining[0])
             for a, b in itertools.pairwise(remaining):
-                is_step = (min(a, b), max(a, b)) in self.tour.overlaps or self.tour.is_fade(a, b)
-                walk += [b] if is_step else self.tour.find_walk(a, b)[1:]
+                walk += self.tour.find_walk(a, b)[1:]
         else:
             edge, _ = self.tour.find_nearest_edge(position, self._find_part(position))
             distances = np.linalg.norm(self.tour.positions[list(edge)] - position, axis=1)
