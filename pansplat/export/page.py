@@ -291,15 +291,12 @@ def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: floa
 
 def _resample(route: Route) -> tuple[Float[np.ndarray, "time 5"], tuple[int, ...]]:
     """Positions, yaws and pitches at `_ROUTE_RATE`, and the samples after which the camera jumps."""
-    columns = np.stack([*route.positions.T, route.yaws, route.pitches])
-    rate = _ROUTE_RATE * route.seconds / (len(route.yaws) - 1)
-    sections = []
-    for section in np.split(columns, route.jumps + 1, axis=1):
-        steps = np.arange(section.shape[1])
-        at = np.linspace(0, steps[-1], max(round(steps[-1] * rate), 1) + 1)
-        sections.append(np.stack([np.interp(at, steps, column) for column in section], axis=1))
-    ends = np.cumsum([len(section) for section in sections])[:-1] - 1
-    return np.concatenate(sections), tuple(ends.tolist())
+    count = max(round(route.seconds * _ROUTE_RATE), 1)
+    moments = [route.at(number / count) for number in range(count + 1)]
+    angles = np.array([find_angles(route.level.T @ moment.pose[:3, 2]) for moment in moments])
+    angles[:, 0] = np.unwrap(angles[:, 0])
+    ends = [k for k, (a, b) in enumerate(pairwise(moments)) if a.step.kind == "zoom" and b.step is not a.step]
+    return np.concatenate([[moment.pose[:3, 3] for moment in moments], angles], axis=1), tuple(ends)
 
 
 def _prepare(scene: Scene) -> Scene:

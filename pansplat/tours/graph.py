@@ -63,7 +63,7 @@ class DrawnPlace(NamedTuple):
 class TourGraph:
     """Panoramas of one place and the edges between them.
 
-    Panoramas that edges connect are a part. Within a part the camera flies; from part to part the image fades. Parts
+    Panoramas that edges connect are a part. Within a part the camera flies; from part to part it zooms. Parts
     without a common world are side by side (`lay_out`).
 
     Attributes:

@@ -18,7 +18,6 @@ from pansplat.tours.outlook import (
     measure_clearance,
     measure_outlook,
 )
-from pansplat.tours.route import plan_route
 from pansplat.tours.surfaces import locate_surfaces
 
 
@@ -47,35 +46,22 @@ def test_the_clearance_is_the_distance_of_the_room_around():
     assert not nothing.any() and find_clearance(nothing, np.array((0.0, 0.0, 1.0))) == math.inf
 
 
-def test_a_flight_turns_from_a_wall_to_the_widest_view(comb):
+def test_an_arrival_turns_from_a_wall_to_the_widest_view():
     wall = np.full(BINS, 3.0)
     wall[BINS // 2 - 3 : BINS // 2 + 4] = 0.6  # ahead, yaw 0
     wall[2:5] = 8.0  # behind on the left
     turned, pitch = choose_arrival(wall, 0.0, 0.3)
     assert turned == pytest.approx((3.5 / BINS - 0.5) * 2 * math.pi) and pitch == 0
     assert choose_arrival(wall, 1.5, 0.3) == (1.5, 0.3) and choose_arrival(np.zeros(BINS), 0.2) == (0.2, 0)
-    start = comb.cam2world[0].numpy()
-    plain, ended = plan_route(comb, [0, 1, 2], start), plan_route(comb, [0, 1, 2], start, wall)
-    assert plain.yaws[-1] == pytest.approx(0, abs=1e-3)
-    assert ended.yaws[-1] == pytest.approx(turned, abs=math.radians(2))
-    assert np.allclose(ended.pose(1.0)[:3, 3], plain.pose(1.0)[:3, 3])
-    assert np.abs(np.diff(ended.yaws)).max() < math.radians(1.0), "not at once"
 
 
-def test_a_way_ends_in_the_start_view_whatever_is_there(comb):
-    wide, start = np.full(BINS, 3.0), comb.cam2world[0].numpy()
+def test_a_way_ends_in_the_start_view_whatever_is_there():
+    wide = np.full(BINS, 3.0)
     assert (
         choose_arrival(wide, 0.7, start=(-0.5, 0.2))
         == choose_arrival(0.1 * wide, 2.0, start=(-0.5, 0.2))
         == (-0.5, 0.2)
     )
-    panoramas = list(comb.panoramas)
-    panoramas[2] = dataclasses.replace(panoramas[2], start=(-0.5, 0.2))
-    tour = dataclasses.replace(comb, panoramas=tuple(panoramas))
-    route = plan_route(tour, [0, 1, 2], start, wide)
-    view = tour.level_axes.T @ tour.find_start_view(2)
-    assert route.level.T @ route.pose(1.0)[:3, 2] == pytest.approx(view, abs=0.03)
-    assert np.abs(np.diff(route.pitches)).max() < math.radians(1.0), "not at once"
 
 
 def test_a_wall_nearer_than_1_2_metres_is_turned_from_in_rooms_of_any_size():
