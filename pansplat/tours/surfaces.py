@@ -6,8 +6,10 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from torch import Tensor
 
+from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Scene
 
 OPAQUE = 0.5  # least opacity of the surfaces that hide and block
@@ -25,13 +27,21 @@ def locate_surfaces(
         level: axes of a level camera, as columns right, down and forward.
         min_opacity: Gaussians of lower opacity are left out.
     """
+    means, center = scene.gaussians.means[_show(scene, view, min_opacity)], scene.cam2world[view, :3, 3]
+    return (means.double().cpu().numpy() - center.double().cpu().numpy()).dot(level)
+
+
+def find_colors(scene: Scene, view: int, *, min_opacity: float) -> Float[np.ndarray, "n 3"]:
+    """The colours, without those of higher degrees of harmonics, of the Gaussians of `locate_surfaces`, in [0, 1]."""
+    harmonics = scene.gaussians.harmonics[_show(scene, view, min_opacity), 0]
+    return (0.5 + SH_0 * harmonics).clamp(0, 1).double().cpu().numpy()
+
+
+def _show(scene: Scene, view: int, min_opacity: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians show the surfaces of a view. Coarse levels have Gaussians behind the surfaces."""
     gaussians = scene.gaussians
-    # Coarse levels have Gaussians behind the surfaces.
     shown = (gaussians.views == view) & (gaussians.opacities > min_opacity) & (gaussians.levels <= 1)
-    shown &= gaussians.means.isfinite().all(dim=1)
-    return (gaussians.means[shown].double().cpu().numpy() - scene.cam2world[view, :3, 3].double().cpu().numpy()).dot(
-        level
-    )
+    return shown & gaussians.means.isfinite().all(dim=1)
 
 
 def sample_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
