@@ -35,7 +35,10 @@ _INCH = 0.0254  # metres
 _DOTS_PER_INCH = 150
 _MARGIN, _LINE = 0.8, 0.35  # around a storey, and between lines of notes, metres
 _TEXT, _SMALL_TEXT, _LEAST_TEXT = 0.22, 0.13, 0.08  # heights, metres
-_SMALL_SHEET = 7.0  # metres, width of one whose texts are large enough in a quarter of a window
+_SMALL_SHEET, _SMALL_SHEET_TEXT = (
+    5.5,
+    0.17,
+)  # metres: width whose texts are legible in a quarter of a window; the largest
 _LETTER = 0.72  # width of a letter, of its height
 _MEASURED = 0.6  # metres, the shortest wall whose length is written
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
@@ -240,7 +243,8 @@ class _Drawing:
         """Names and areas of rooms, names of panoramas outside of rooms, and lengths of walls where there is space."""
         outlines = {room: self.outline(room) for room in self.rooms}
         walls = shapely.union_all([Polygon(corners).exterior for corners in outlines.values()])
-        large, small, least = (self.enlarged * size for size in (_TEXT, _SMALL_TEXT, _LEAST_TEXT))
+        sizes = (_SMALL_SHEET_TEXT, _SMALL_TEXT, _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
+        large, small, least = (self.enlarged * size for size in sizes)
         taken, texts = shapely.MultiPoint(self.panoramas).buffer(small), list[_Text]()
 
         def add(*options: _Text) -> None:
