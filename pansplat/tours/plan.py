@@ -57,7 +57,8 @@ _LEAST_AREA = 0.4  # of a room, squared camera heights
 _BEYOND = 0.25  # of the floor behind an opening
 _LOW = 0.5, 0.9  # where an opening that reaches to the floor is seen, fractions of the height below the camera
 _BROAD, _LEAST_HALF = (0.12, 0.88), 0.5  # of the ends of a floor, which goes on behind doors; half a rectangle's side
-_LEAST_PIECE = 0.1  # of a rectangle, without other rooms, squared camera heights
+_LEAST_PIECE = 0.1  # of a rectangle without other rooms, squared camera heights
+_EYE_BAND = 0.4  # heights of the surfaces around a rectangle, over and under the camera
 _DOOR_WIDTHS = 0.33, 1.7
 _SAME_DOOR = 0.4  # distance of the middles of an opening from two sides
 _NEAR_WALL, _LEAST_SEEN = 0.2, 8  # places that show a wall; number of them by one panorama
@@ -204,8 +205,13 @@ def make_plan(scene: Scene, tour: TourGraph, heights: Sequence[float | None]) ->
         found = [(*room, True) for room in _outline_rooms(sights, members, normals, unit)] if members else []
         free = {k for k in range(count) if (parts[k], storeys[k]) == (part, storey)}.difference(*(n for n, *_ in found))
         for view in sorted(free):
+            point = shapely.Point(tour.positions[view] @ level[:, (0, 2)])
+            inside = [n for n, (_, outline, _) in enumerate(found) if Polygon(outline).contains(point)]
             beside = shapely.union_all([Polygon(outline) for _, outline, _ in found])
-            if (outline := _enclose(scene, view, level, normals, beside, unit)) is not None:
+            if inside:
+                nodes, *others = found[inside[0]]
+                found[inside[0]] = ((*nodes, view), *others)
+            elif (outline := _enclose((scene, view, level), normals, beside, unit)) is not None:
                 found.append(((view,), outline, False))
         for nodes, outline, is_closed in found:
             is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
@@ -217,26 +223,25 @@ def make_plan(scene: Scene, tour: TourGraph, heights: Sequence[float | None]) ->
 
 
 def _enclose(
-    scene: Scene,
-    view: int,
-    level: Float[np.ndarray, "3 3"],
-    normals: Float[np.ndarray, "direction 2"],
-    beside: shapely.Geometry,
-    unit: float,
+    view: tuple[Scene, int, Float[np.ndarray, "3 3"]], normals: np.ndarray, beside: shapely.Geometry, unit: float
 ) -> Outline | None:
-    """A rectangle along the walls around a camera without closed walls: the extent of its floor, or of its surfaces,
-    without the rooms beside it; None if nothing of it is left."""
-    center, floor = (
-        level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy(),
-        find_floor_outline(scene, view, level),
-    )
+    """A rectangle along the walls around a camera without closed walls: the extent of its floor, or of the surfaces at
+    its height, without the rooms beside it; None if nothing of it is left.
+
+    Args:
+        view: scene, number and level axes.
+    """
+    scene, number, level = view
+    center, floor = level[:, (0, 2)].T @ scene.cam2world[number, :3, 3].double().numpy(), find_floor_outline(*view)
+    places = sample_surfaces(*view)
+    ends = _measure_reach(places[np.abs(places[:, 1]) < _EYE_BAND * unit][:, (0, 2)])[:, None] * ray_directions()
+    corners = center + ends[np.isfinite(ends[:, 0])] if floor is None else floor.corners
     axes, least = np.stack((normals[0], (-normals[0, 1], normals[0, 0])), axis=1), _LEAST_HALF * unit
-    places = center + sample_surfaces(scene, view, level)[:, (0, 2)] if floor is None else floor.corners
-    low, high = np.quantile(places @ axes, _BROAD, axis=0) if len(places) else (center @ axes,) * 2
+    low, high = np.quantile(corners @ axes, _BROAD, axis=0) if len(corners) else (center @ axes,) * 2
     low, high = np.minimum(low, center @ axes - least), np.maximum(high, center @ axes + least)
     box = Polygon(shapely.get_coordinates(shapely.box(*low, *high)) @ axes.T)
-    free = box.difference(beside).buffer(0)
-    pieces = [piece for piece in shapely.get_parts(_clean(free, unit)) if piece.area > _LEAST_PIECE * unit**2]
+    free = _clean(box.difference(beside).buffer(0), unit)
+    pieces = [piece for piece in shapely.get_parts(free) if piece.area > _LEAST_PIECE * unit**2]
     piece = min(pieces, key=lambda piece: piece.distance(shapely.Point(center)), default=None)
     return None if piece is None else np.array(shapely.orient_polygons(piece).exterior.coords)[:-1]
 
@@ -569,7 +574,7 @@ def _find_doors(rooms: Sequence[Room], sights: Sequence[_Sight | None], unit: fl
     """The openings through which panoramas show what is beyond the walls of their rooms, down to the floor."""
     found: list[tuple[int, np.ndarray, int]] = []  # room, ends, rays
     for number, room in enumerate(rooms):
-        for node in room.panoramas if room.is_closed else ():
+        for node in [node for node in room.panoramas if room.is_closed and sights[node] is not None]:
             found += [(number, ends, rays) for ends, rays in _find_openings(sights[node], room.outline, unit)]
     found.sort(key=lambda opening: -opening[2])
     doors: list[Door] = []
