@@ -245,7 +245,8 @@ class _Drawing:
         walls = shapely.union_all([Polygon(corners).exterior for corners in outlines.values()])
         sizes = (_SMALL_SHEET_TEXT, _SMALL_TEXT, _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
         large, small, least = (self.enlarged * size for size in sizes)
-        taken, texts = shapely.MultiPoint(self.panoramas).buffer(small), list[_Text]()
+        taken = shapely.MultiPoint(self.panoramas).buffer(small) | shapely.box(0, 0, *self.size).exterior.buffer(0.01)
+        texts: list[_Text] = []
 
         def add(*options: _Text) -> None:
             nonlocal taken

@@ -1620,7 +1620,7 @@ def test_the_floor_plan_is_a_drawing_with_the_camera_and_leads_to_panoramas(chro
         assert corner + place * (drawing["width"], drawing["height"]) == pytest.approx(centers[0], abs=0.6)
         position = np.array(page.run("HEADER.spots[0].position")) + 0.5 * np.array(page.run("HEADER.level"))[:, 0]
         page.run("(position) => pansplat.setPose({ position })", position.tolist())
-        page.wait(f"parseFloat({here}.left) !== {100 * place[0]}")
+        page.settle()
         moved = np.array([float(page.run(f"parseFloat({here}.{side})")) for side in ("left", "top")]) / 100
         expected = 0.5 * np.array((math.cos(math.radians(turn)), math.sin(math.radians(turn))))
         assert (moved - place) * plan["size"] == pytest.approx(expected, abs=1e-3)
