@@ -243,7 +243,9 @@ class _Drawing:
         """Names and areas of rooms, names of panoramas outside of rooms, and lengths of walls where there is space."""
         outlines = {room: self.outline(room) for room in self.rooms}
         walls = shapely.union_all([Polygon(corners).exterior for corners in outlines.values()])
-        sizes = (_SMALL_SHEET_TEXT, _SMALL_TEXT, _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
+        sizes = (
+            (_SMALL_SHEET_TEXT, _SMALL_TEXT, 0.75 * _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
+        )
         large, small, least = (self.enlarged * size for size in sizes)
         taken = shapely.MultiPoint(self.panoramas).buffer(small) | shapely.box(0, 0, *self.size).exterior.buffer(0.01)
         texts: list[_Text] = []
@@ -264,8 +266,8 @@ class _Drawing:
             lines = [f"{area} m² ± {error}"] * room.is_closed + ["about here"] * (room.panoramas[0] in self.plan.drawn)
             for row, text in zip((0.7, -0.7, -2.1), [room.name, *lines[: 0 if self.is_small else None]], strict=False):
                 size = min(large, 0.9 * radius / math.hypot(_LETTER * len(text) / 2, abs(row) + 0.5))
+                inside |= set(room.panoramas[size <= least :])  # one of them has the name of a small room
                 if size > least:
-                    inside |= set(room.panoramas)
                     add(_Text("ROOMS", (x, y + row * size), text, size))
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
