@@ -24,11 +24,9 @@ from urllib.parse import quote
 import msgspec
 import numpy as np
 import scipy
-import shapely
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
-from shapely.geometry import Point, Polygon
 from torch import Tensor
 
 from pansplat import constants, pipeline
@@ -37,6 +35,7 @@ from pansplat.export.doll_house import DollHouse, make_house
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
+from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
@@ -51,12 +50,10 @@ from pansplat.system.files import is_written
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
 from pansplat.tours.outlook import choose_arrival, find_turned
-from pansplat.tours.plan import Plan, Room
 from pansplat.tours.route import Route, find_angles, plan_route
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
@@ -76,10 +73,7 @@ _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
 _TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
 _POSTER_SIZE = (810, 960)  # height and width, pixels
-_UNKNOWN_FLOOR, _ROUGH_OUTLINE = (
-    1.5,
-    0.1,
-)  # metres, around a panorama without a floor; of what is smoothed of a floor's end
+_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "size": (1.0, 1.0), "places": ()}
 _ROUTE_RATE = 10  # samples of a flight a second
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
@@ -162,11 +156,9 @@ def write_page(
     )
     tour = dataclasses.replace(facts.tour, poor=facts.poor)
     rooms = find_rooms(facts) if has_cameras else None
-    plan = None if rooms is None or not rooms.plan.num_heights else rooms.plan
-    floors = _outline_floors(facts, () if plan is None else plan.rooms) if has_cameras else []
     scene = prepared
     flights = _plan_flights(scene, tour, facts)
-    house, has_pictures = DollHouse((), b""), len(photographs) > 0 and photo_height != 0
+    house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, rooms, flights.level, photographs if has_pictures else ())
@@ -190,7 +182,7 @@ def write_page(
     report_progress("writing", 0.95)
     header = _describe_scene(scene, packed, origin, flights, tour, facts)
     header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
-    header["plan"] = _describe_plan(plan, floors, tour, origin, flights.level)
+    header["plan"] = _describe_plan(facts, flights.level) if has_cameras else _NO_PLAN
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
             {
@@ -200,8 +192,10 @@ def write_page(
             }
             for note in photograph.context[0].notes
         ]
-    for nodes, corners in zip(() if rooms is None else rooms.houses, house.corners, strict=True):
-        header["doll"].append({"nodes": nodes, "corners": (corners - [*origin, 0, 0]).round(5).tolist()})
+    for nodes, corners in zip(house.nodes, house.corners, strict=True):
+        moves = [(turn, *_round(place - origin)) for turn, place in nodes.values()]
+        corners = (corners - [*origin, 0, 0]).round(5).tolist()
+        header["doll"].append({"nodes": [*nodes], "moves": moves, "corners": corners})
     files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title or path.stem)
     inside = sum(len(each["nodes"]) for each in header["doll"])
     return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
@@ -493,60 +487,23 @@ def _describe_outlook(facts: TourFacts, view: int, start: Float[np.ndarray, "3"]
     return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": facts.hidden[view], "clearances": clearances}
 
 
-def _outline_floors(facts: TourFacts, rooms: Sequence[Room]) -> list[Room]:
-    """Rooms around the panoramas that stand in none of the floor plan: where their floor ends, else a circle."""
-    floors: list[Room] = []
-    tour, storeys = facts.tour, assign_storeys(facts.tour)
-    for node, center in enumerate(tour.positions @ tour.level_axes[:, (0, 2)]):
-        point = Point(center)
-        if not any(room.storey == storeys[node] and Polygon(room.outline).contains(point) for room in rooms):
-            found = facts.outlines.get(node)
-            shape = point.buffer(_UNKNOWN_FLOOR) if found is None else Polygon(found.corners)
-            outline = np.array(shape.simplify(_ROUGH_OUTLINE).exterior.coords)[:-1]
-            name = tour.panoramas[node].title or tour.panoramas[node].name
-            floors.append(Room(name, (node,), outline, storeys[node], tour.is_placed(node)))
-    return floors
-
-
-def _describe_plan(
-    plan: Plan | None,
-    floors: Sequence[Room],
-    tour: TourGraph,
-    origin: Float[np.ndarray, "3"],
-    level: Float[np.ndarray, "3 3"],
-) -> dict[str, Any]:
-    """The floor plan: outlines and names of rooms and the doors, to the right and forward of the origin, and the world
-    of each panorama; panoramas of other worlds are elsewhere.
+def _describe_plan(facts: TourFacts, level: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
+    """The floor plan: its drawing, and where the panoramas are on it.
 
     Args:
-        floors: of `_outline_floors`.
+        level: axes that yaws of the page are relative to.
     """
-    worlds = tour.worlds or (0,)
-    known = [] if plan is None else [*plan.rooms]
-    if not known and not floors:
-        return {"worlds": worlds, "drawn": [], "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
-    turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
-    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in (*known, *floors)]
-    turns = Plan(tour, tuple(turned), (), math.nan, None, None, 0, 0).turns
-    rooms = []
-    for number, room in enumerate(turned):
-        circle = shapely.maximum_inscribed_circle(Polygon(room.outline))
-        label = [*_round(np.array(circle.coords[0]) - middle), round(2 * circle.length, 4)]
-        outline = [_round(corner) for corner in room.outline - middle]
-        rooms.append(
-            {
-                "name": room.name,
-                "nodes": room.panoramas,
-                "outline": outline,
-                "label": label,
-                "hasWalls": number < len(known),
-            }
-        )
-    doors = [] if plan is None else plan.doors
-    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in doors]
-    found = [tour.approximate.get(node) for node in range(len(tour))]
-    drawn = [each and (each.beside, *_round(each.place @ turn - middle), round(each.turn, 5)) for each in found]
-    return {"worlds": worlds, "drawn": drawn, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
+    svg, size, marks = draw_page_plan(facts.plan)
+    right, forward = facts.tour.level_axes[:, (0, 2)].T @ level[:, 2]
+    places = [(x, y, None if turn is None else turn + math.atan2(right, forward)) for x, y, turn in marks]
+    rooms = [room.panoramas for room in facts.plan.rooms]
+    return {
+        "worlds": facts.tour.worlds,
+        "rooms": rooms,
+        "drawing": base64.b64encode(svg).decode(),
+        "size": size,
+        "places": places,
+    }
 
 
 def _describe_links(

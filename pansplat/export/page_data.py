@@ -102,40 +102,32 @@ class PagePhotograph(_Record):
     rotation: tuple[Vector, Vector, Vector]
 
 
-class PageRoom(_Record):
-    """A room of the floor plan, or without walls where the floor of a panorama ends; `label` is the middle and the
-    width of its name. To the right and forward."""
-
-    name: str
-    nodes: tuple[int, ...]
-    outline: tuple[tuple[float, float], ...]
-    label: Vector
-    has_walls: bool
-
-
-class PageDoor(_Record):
-    """A door of a room of the plan."""
-
-    room: int
-    ends: tuple[tuple[float, float], ...]
-
-
 class PagePlan(_Record):
-    """The floor plan: the world of each panorama, the angle that turns each world, and where panoramas at approximate
-    places are drawn (`DrawnPlace`): beside which one, to the right and forward, and their turn."""
+    """The floor plan.
+
+    Attributes:
+        worlds: of each panorama.
+        rooms: the panoramas of each room.
+        drawing: an SVG, base64.
+        size: its width and height, metres.
+        places: of each panorama, to the right and down from the upper left corner, metres; and what yaws there are
+            turned by, radians to the right, None if that is unknown.
+    """
 
     worlds: tuple[int, ...]
-    drawn: tuple[tuple[int, float, float, float] | None, ...]
-    turns: tuple[float, ...]
-    rooms: tuple[PageRoom, ...]
-    doors: tuple[PageDoor, ...]
+    rooms: tuple[tuple[int, ...], ...]
+    drawing: str
+    size: tuple[float, float]
+    places: tuple[tuple[float, float, float | None], ...]
 
 
 class PageHouse(_Record):
     """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas;
-    of tops of walls 2 + the normal of the wall, to the right and forward."""
+    of tops of walls 2 + the normal of the wall, to the right and forward. `moves`: what the
+    surroundings of each panorama are turned by, radians to the right, and where its camera is then."""
 
     nodes: tuple[int, ...]
+    moves: tuple[tuple[float, float, float, float], ...]
     corners: tuple[tuple[float, float, float, float, float], ...]
 
 

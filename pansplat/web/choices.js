@@ -1,6 +1,6 @@
 // What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
 
-import { clamp, distanceOf } from "./graph.js";
+import { distanceOf } from "./graph.js";
 import { edges, GRAPH, parts } from "./state.js";
 
 const isFlown = (from, to) => {
@@ -12,7 +12,7 @@ const isFlown = (from, to) => {
 // Where all flights are hidden, the nearest one stays.
 export function chooseRings(here) {
   const { rooms } = HEADER.plan, { hidden } = HEADER.spots[here];
-  const roomOf = (node) => rooms.findIndex(({ nodes }) => nodes.includes(node));
+  const roomOf = (node) => rooms.findIndex((nodes) => nodes.includes(node));
   const away = (node) => distanceOf(GRAPH.positions[node], GRAPH.positions[here]);
   const links = HEADER.links.filter(({ from }) => from === here), linked = links.map(({ to }) => to);
   const flown = HEADER.spots.map((_, node) => node).filter((node) => node !== here && isFlown(here, node) && !linked.includes(node));
@@ -46,21 +46,3 @@ export function chooseArrival(node, { yaw, pitch }, from = node) {
 
 // Whether two boxes have a place in common; `[left, top, right, bottom]`.
 export const isCovered = (a, b) => a[0] <= b[2] && a[2] >= b[0] && a[1] <= b[3] && a[3] >= b[1];
-
-const DOT = 7, GAP = 3;  // pixels: half of a panorama's dot in the plan, and between a name and the border
-
-// Where names stand in a plan: the middle of each, as near to its own as it covers neither a dot nor a name before; null where
-// there is no such place.
-export function placeNames(names, dots, [across, tall]) {
-  const taken = dots.map(([x, y]) => [x - DOT, y - DOT, x + DOT, y + DOT]);
-  return names.map(({ x, y, width, height }) => {
-    const half = 0.5 * width + GAP, middle = clamp(x, half, Math.max(across - half, half));
-    for (const step of [0, -1, 1, -2, 2, -3, 3]) {
-      const at = y + 0.6 * step * height, box = [middle - half, at - 0.5 * height, middle + half, at + 0.5 * height];
-      if (box[1] < 0 || box[3] > tall || taken.some((other) => isCovered(box, other))) continue;
-      taken.push(box);
-      return [middle, at];
-    }
-    return null;
-  });
-}

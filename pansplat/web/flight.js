@@ -3,7 +3,7 @@
 
 import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
 import { chooseArrival, findLink } from "./choices.js";
-import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit } from "./doll.js";
+import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit, placeInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import {
   clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
@@ -75,15 +75,15 @@ function enterDoll() {
 const canShowDoll = () => state.sorted !== null && byId("atlas")?.complete === true;
 
 // Flies into a panorama, and ends there; by default it looks where the camera looks from outside.
-function visit(node, heading = chooseArrival(node, { yaw: camera.yaw, pitch: 0 })) {
+function visit(node, heading = null) {
   if (!isInDoll(node)) {
     jumpTo(node);
     return;
   }
   state.doll.node = node;
-  flyDoll({ position: [...HEADER.spots[node].position], ...heading, fov: state.doll.fov }, () => {
-    jump(HEADER.spots[node].position, heading);
-  });
+  const { position } = HEADER.spots[node], { place, turn } = placeInDoll(node, position);
+  const end = heading || chooseArrival(node, { yaw: camera.yaw - turn, pitch: 0 });
+  flyDoll({ position: place, ...end, yaw: end.yaw + turn, fov: state.doll.fov }, () => jump(position, end));
 }
 
 // Goes to the panorama nearest to what a point of the window shows.

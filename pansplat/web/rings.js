@@ -2,7 +2,7 @@
 
 import { nodeHere, tangentOf } from "./camera.js";
 import { chooseRings, isCovered } from "./choices.js";
-import { isInDoll } from "./doll.js";
+import { isInDoll, placeInDoll } from "./doll.js";
 import { byId, canvas, make } from "./dom.js";
 import { goTo } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus } from "./graph.js";
@@ -53,7 +53,8 @@ export function placeRings(rotation) {
   const bars = ["buttons", "place"].map((id) => byId(id).getBoundingClientRect()).map((bar) => [bar.left, bar.top, bar.right, bar.bottom]);
   const taken = [...bars], placed = [];
   for (const ring of rings) {
-    const { radius } = ring, offset = minus(ring.mark, camera.position);
+    const { radius } = ring, isMoved = state.doll.isOn && isInDoll(ring.node), mark = isMoved ? placeInDoll(ring.node, ring.mark).place : ring.mark;
+    const offset = minus(mark, camera.position);
     const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
     ring.button.hidden = !found.includes(ring) || z < 0.1 * radius;
     if (!ring.button.hidden) placed.push({ ring, x, y, z, distance: Math.hypot(x, y, z) });

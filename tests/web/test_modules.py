@@ -122,6 +122,7 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         {"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": "", "clearances": []}
         for place in positions
     ]
+    house = make_house([node for node, part in enumerate(parts) if part == 0])
     return {
         "spots": spots,
         "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
@@ -136,7 +137,7 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         "poor": [],
         "next": [],
         "tallest": 1.5,
-        "doll": [make_house([node for node, part in enumerate(parts) if part == 0])],
+        "doll": [house | {"moves": [(0.0, *positions[node]) for node in house["nodes"]]}],
     }
 
 
@@ -217,7 +218,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
 def choose_rings(node: str, folder: Path, *, links: Any = (), hidden: Any = (), rooms: Any = (), here: int = 0) -> list:
     """The rings of a panorama in a row of four, the last one in another part, with `{from, to, mark}` of links."""
     header = make_header(ROW, [(0, 1), (0, 2), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"links": list(links)}
-    header["plan"] = {"rooms": [{"nodes": nodes} for nodes in rooms]}
+    header["plan"] = {"rooms": list(rooms)}
     for number, spot in enumerate(header["spots"]):
         spot["hidden"] = list(hidden) if number == here else []
     found = run(node, folder, header, "(here) => chooseRings(here)", here)
@@ -274,31 +275,6 @@ def test_arrivals_follow_the_table_of_the_panorama_and_come_away_from_the_link_b
     assert (away, kept) == ({"yaw": pytest.approx(1 + math.pi), "pitch": 0}, {"yaw": 2, "pitch": 0.2})
     unknown, _ = run(node, tmp_path, header, arrive, 1)
     assert unknown == {"yaw": pytest.approx(find_turned(outlook)[1][0]), "pitch": 0}, "of another world, without a link"
-
-
-def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: Path) -> None:
-    random = np.random.default_rng(3)
-    dots = random.uniform(20, 280, (9, 2))
-    names = [{"x": x, "y": y, "width": 60, "height": 13} for x, y in [*dots, *dots[:4], (-5, 150), (299, 150)]]
-    places = run(
-        node,
-        tmp_path,
-        make_header(ROW, [], [0] * 4),
-        "(...all) => placeNames(...all)",
-        names,
-        dots.tolist(),
-        [300, 300],
-    )
-    boxes = [(x - 30, y - 6.5, x + 30, y + 6.5) for x, y in filter(None, places)]
-    assert len(boxes) > 9 and all(box[0] >= 0 and box[2] <= 300 and box[1] >= 0 and box[3] <= 300 for box in boxes)
-    for number, (left, top, right, bottom) in enumerate(boxes):
-        assert not any(left - 5 < x < right + 5 and top - 5 < y < bottom + 5 for x, y in dots)
-        others = boxes[:number]
-        assert not any(left < box[2] and right > box[0] and top < box[3] and bottom > box[1] for box in others)
-    crowd = [[x, y] for x in range(0, 300, 10) for y in range(0, 300, 10)]
-    assert run(
-        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names[:1], crowd, [300, 300]
-    ) == [None]
 
 
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
@@ -451,6 +427,19 @@ def test_the_dolls_house_stays_in_the_picture_when_it_is_turned(node: str, tmp_p
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
     distances, first, widths = run(node, tmp_path, header, program, (390, 844))
     assert max(widths) <= 1 and min(distances) == pytest.approx(first) and max(distances) > 1.3 * first
+
+
+def test_the_dolls_house_is_beside_an_open_floor_plan(node: str, tmp_path: Path) -> None:
+    program = """(size, covered) => {
+        state.doll.covered = covered;
+        Object.assign(camera, frameDoll(size));
+        const local = findHouse().corners.map((place) => minus(place, camera.position)).map((place) =>
+            [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), place)));
+        return local.map(([x, , z]) => 0.5 * size[0] + 0.5 * size[1] * x / z / tangentOf(...size, camera.fov));
+    }"""
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    covered, free = (run(node, tmp_path, header, program, (320, 720), width) for width in (80, 0))
+    assert min(covered) >= 80 and max(covered) <= 320 and min(free) < 80
 
 
 def test_a_ray_meets_the_nearest_front_of_the_dolls_house(node: str, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The files of a page, without a browser."""
 
+import base64
 import dataclasses
 import gzip
 import json
@@ -25,6 +26,7 @@ from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
 from pansplat.export.page import write_page
+from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -74,12 +76,18 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     header = read_header(tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     tour = make_graph(room)
-    (drawn,), (expected,) = header["plan"]["rooms"], TourFacts(room).plan.rooms
-    assert drawn["name"] == "west / east" and drawn["nodes"] == [0, 1] and header["plan"]["worlds"] == [0, 0]
+    found, (expected,) = header["plan"], TourFacts(room).plan.rooms
+    svg, size, marks = draw_page_plan(TourFacts(room).plan)
+    assert found["rooms"] == [[0, 1]] and found["worlds"] == [0, 0] and b"west / east" in svg
+    assert base64.b64decode(found["drawing"]) == svg and found["size"] == pytest.approx(size)
     turn = level[:, (0, 2)].T @ tour.level_axes[:, (0, 2)]  # they differ by a quarter turn
-    outline = np.array(drawn["outline"]) + level[:, (0, 2)].T @ middle
-    assert shapely.Polygon(outline).symmetric_difference(shapely.Polygon(expected.outline @ turn.T)).area < 0.05
-    assert shapely.Polygon(outline).contains(shapely.Point(np.array(drawn["label"][:2]) + level[:, (0, 2)].T @ middle))
+    quarter = math.atan2(*(tour.level_axes[:, (0, 2)].T @ level[:, 2]))
+    for place, (x, y, heading) in zip(found["places"], marks, strict=True):
+        assert place == pytest.approx((x, y, heading + quarter), abs=1e-5) and abs(quarter) > 1.5
+    c, s = math.cos(found["places"][0][2]), math.sin(found["places"][0][2])
+    step = (cameras[1, :3, 3] - cameras[0, :3, 3]).numpy() @ level[:, (0, 2)] @ ((c, -s), (s, c)) * (1, -1)
+    assert np.subtract(found["places"][1], found["places"][0])[:2] == pytest.approx(step, abs=1e-5)
+    outline = expected.outline @ turn.T
     (house,) = header["doll"]
     corners = np.array(house["corners"])
     top = corners[:, 3:].max(axis=1) > 1
@@ -128,23 +136,7 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     assert (
         headers[1]["doll"] == [] and page.num_outside == 3 and 'id="atlas"' not in (tmp_path / "none.html").read_text()
     )
-    assert not any(room["hasWalls"] for room in headers[1]["plan"]["rooms"])
-    assert headers[1]["plan"]["worlds"] == [0, 0, 0]
-
-
-def test_every_panorama_stands_in_an_outline_of_its_storey(flat: Scene) -> None:
-    tour, facts = make_graph(flat), TourFacts(flat)
-    floors = page_module._outline_floors(facts, ())
-    assert [room.panoramas for room in floors] == [(0,), (1,), (2,), (3,)]
-    places = tour.positions @ tour.level_axes[:, (0, 2)]
-    assert all(shapely.Polygon(room.outline).contains(shapely.Point(places[room.panoramas[0]])) for room in floors)
-    around = dataclasses.replace(floors[0], outline=shapely.Point(places[0]).buffer(60).exterior.coords[:])
-    assert page_module._outline_floors(facts, [around]) == [], "all stand in it"
-    above = dataclasses.replace(around, storey=around.storey + 1)
-    assert len(page_module._outline_floors(facts, [above])) == 4
-    hidden = flat.gaussians.select(flat.gaussians.means[:, 1] < -2)  # no floor
-    (circle, *_) = page_module._outline_floors(TourFacts(dataclasses.replace(flat, gaussians=hidden)), ())
-    assert shapely.Polygon(circle.outline).area == pytest.approx(math.pi * 1.5**2, rel=0.1)
+    assert headers[1]["plan"]["worlds"] == [0, 0, 0] and len(headers[1]["plan"]["places"]) == 3
 
 
 def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
