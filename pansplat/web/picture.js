@@ -1,7 +1,7 @@
 // Pictures of the camera, and what a point of the window shows.
 
-import { blendWeights, rotationOf, tangentOf } from "./camera.js";
-import { meetHouse } from "./doll.js";
+import { blendWeights, isFixed, nodeHere, rotationOf, tangentOf } from "./camera.js";
+import { findHouse, meetHouse } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { dot, scaled } from "./graph.js";
 import { drawHouse } from "./house.js";
@@ -33,6 +33,7 @@ export function rayOf(left, top) {
 export function measureAt(left, top) {
   if (!state.renderer || !state.sorted) return null;
   if (state.doll.isOn) return meetHouse(camera.position, rayOf(left, top));
+  if (isFixed()) return meetHouse(camera.position, rayOf(left, top), findHouse(nodeHere()) || { corners: [] });
   const [width, height] = fullSize(), tangent = tangentOf(width, height), half = [tangent / height, tangent / height];
   const seen = { position: camera.position, rotation: rotationOf(camera), center: planeOf(left, top), half };
   return state.renderer.measure(seen, blendWeights(seen));
