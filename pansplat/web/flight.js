@@ -146,7 +146,7 @@ function planWay(spot) {
   let from = isThere ? here : null, position = [...camera.position], end = chooseArrival(spot, camera);
   way.forEach((node, i) => {
     const before = i > 0 ? way[i - 1] : null, isZoom = before !== null && isFade(GRAPH, before, node);
-    const isLeft = i + 1 < way.length && isFade(GRAPH, node, way[i + 1]) && i === 0;  // it fades where the camera is
+    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node);  // a zoom begins where the camera is
     if (node === from || isLeft) return;
     const heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || camera;
     if (heading) legs.push({ view: { yaw: heading.yaw, pitch: heading.pitch } });
