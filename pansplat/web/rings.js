@@ -97,10 +97,11 @@ function findBorder(offset, focal, sides, taken) {
   if (side === null || sides[side] === MAX_ARROWS) return null;
   const most = [width, height].map((length) => length - ARROW - BORDER), half = 0.5 * ARROW, [x, y] = [around, -above].map((angle) => focal * Math.tan(clamp(angle, -1.5, 1.5)));
   const at = [0.5 * width + x - half, 0.5 * height + y - half];
-  const boxes = [...Array(40).keys()].map((k) => (k % 2 ? 1 : -1) * half * Math.ceil(k / 2)).map((step) => {
-    const [left, top] = at.map((value, k) => clamp(value + (isBeside === (k === 1) ? step : 0), BORDER, most[k]));
+  const inward = { left: [1, 0], right: [-1, 0], up: [0, 1], down: [0, -1] }[side], steps = [...Array(40).keys()].map((k) => (k % 2 ? 1 : -1) * half * Math.ceil(k / 2));
+  const boxes = [0, 1, 2].flatMap((row) => steps.map((step) => {  // beside the place, else above what is there
+    const [left, top] = at.map((value, k) => clamp(value + step * !inward[k], BORDER, most[k]) + row * (ARROW + BORDER) * inward[k]);
     return [left, top, left + ARROW, top + ARROW];
-  });
+  }));
   const box = boxes.find((each) => taken.every((other) => !isCovered(each, other)));
   if (!box) return null;
   sides[side] += 1;

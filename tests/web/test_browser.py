@@ -1612,6 +1612,13 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
         })""")
         assert all(ring["name"] in ("room 1", "room 2") for ring in found)
         assert min(ring["size"] for ring in found) < 40 and any(all(ring["hit"]) for ring in found)
+        page.run("pansplat.setPose({ yaw: 45, pitch: 30 })")
+        page.settle()
+        arrows = page.run("""Array.from(document.querySelectorAll("#spots .arrow:not([hidden])"), (button) => {
+            const { left, top } = button.getBoundingClientRect();
+            return document.elementFromPoint(left + 22, top + 22) === button;
+        })""")
+        assert len(arrows) == 2 and all(arrows), "over the row of buttons"
         right = page.run(
             "Array.from(document.querySelectorAll('#buttons > :not([hidden])'), (e) => e.getBoundingClientRect().left)"
         )
