@@ -12,14 +12,14 @@ const DOLL_ZOOM = [0.15, 2];                       // of the distance from which
 const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
 // The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
-export const findHouse = () => HEADER.doll.find(({ nodes }) => nodes.includes(state.doll.node));
+export const findHouse = (node = state.doll.node) => HEADER.doll.find(({ nodes }) => nodes.includes(node));
 
 // Whether a panorama is in the house that is shown.
 export const isInDoll = (node) => findHouse().nodes.includes(node);
 
 // Where a place around a panorama is in the house, and what yaws there are turned by: rooms of other worlds stand beside it.
-export function placeInDoll(node, place) {
-  const { nodes, moves } = findHouse(), [turn, ...shown] = moves[nodes.indexOf(node)], [c, s] = [Math.cos(turn), Math.sin(turn)];
+export function placeInDoll(node, place, { nodes, moves } = findHouse()) {
+  const [turn, ...shown] = moves[nodes.indexOf(node)], [c, s] = [Math.cos(turn), Math.sin(turn)];
   const [x, y, z] = [0, 1, 2].map((k) => dot(column(HEADER.level, k), minus(place, HEADER.spots[node].position)));
   return { place: plus(shown, HEADER.level.map((row) => dot(row, [c * x + s * z, y, c * z - s * x]))), turn };
 }
@@ -95,8 +95,7 @@ export const nearestInDoll = (point) => {
 };
 
 // The distance to the first front of the house along a ray; null without one. Corners are clockwise in front.
-export function meetHouse(origin, ray) {
-  const { corners } = findHouse();
+export function meetHouse(origin, ray, { corners } = findHouse()) {
   let nearest = null;
   for (let first = 0; first < corners.length; first += 3) {
     const [a, b, c] = corners.slice(first, first + 3), normal = cross(minus(b, a), minus(c, a)), toward = dot(normal, ray);

@@ -21,7 +21,6 @@ from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 from pansplat.tours.layout import REACH
-from pansplat.tours.outlook import choose_arrival, find_turned
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
@@ -246,35 +245,31 @@ def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
     assert linked == [(2, None), (0, None)], "that of a link comes before"
 
 
-def test_arrivals_follow_the_table_of_the_panorama_and_come_away_from_the_link_back(node: str, tmp_path: Path) -> None:
+def test_a_way_ends_in_the_start_view_or_straight_on_and_away_from_the_link_back(node: str, tmp_path: Path) -> None:
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
-    header |= {"links": [{"from": 3, "to": 2, "leave": [0, 0, 0], "yaw": 1.0}], "plan": {"worlds": [0, 0, 0, 1]}}
-    outlook = np.full(24, 3.0)
-    outlook[11:14] = 1.0
-    outlook[4] = 9.0
-    for spot, start in zip(header["spots"], (None, (0.4, 0.3), None, None), strict=True):
-        is_turned, ahead = find_turned(outlook, start)
-        spot |= {"turned": sum(1 << k for k in np.flatnonzero(is_turned).tolist()), "ahead": ahead}
-    yaws = np.linspace(-7, 7, 61)
+    header["plan"] = {"worlds": [0, 0, 0, 1]}
+    header["links"] = [{"from": 3, "to": 2, "yaw": 1.0, "pitch": -0.6}]
+    for number, spot in enumerate(header["spots"]):
+        spot |= {"ahead": [0.4, 0.3], "hasStart": number == 1}
+    headings = run(node, tmp_path, header, "() => [[0, 1], [1, 0], [3, 2], [0, 3]].map((way) => findHeading(...way))")
+    level = [{"yaw": 0, "pitch": 0}, {"yaw": math.pi, "pitch": 0}]
+    assert headings == [*level, {"yaw": 1.0, "pitch": -0.2}, None], "not down to the floor; of another world"
+    program = "(ways) => ways.map(([node, heading, from]) => Object.values(chooseArrival(node, heading, from)))"
+    way = {"yaw": 2.0, "pitch": 0.2}
     found = run(
-        node,
-        tmp_path,
-        header,
-        "(yaws) => [0, 1].map((node) => yaws.map((yaw) => Object.values(chooseArrival(node, { yaw, pitch: 0.2 }))))",
-        yaws.tolist(),
+        node, tmp_path, header, program, [[1, way], [0, way], [0, None], [3, way, 2], [1, way, 2], [2, None, 3]]
     )
-    for row, start in zip(found, (None, (0.4, 0.3)), strict=True):
-        wrapped = [choose_arrival(outlook, math.remainder(yaw, 2 * math.pi), 0.2, start) for yaw in yaws]
-        expected = [(yaw if end[1] == 0.2 else end[0], end[1]) for yaw, end in zip(yaws, wrapped, strict=True)]
-        np.testing.assert_allclose(row, expected)
-        assert len({end[1] for end in row}) == (2 if start is None else 1)
-    arrive = (
-        "(from) => [chooseArrival(3, { yaw: 0.5, pitch: 0.2 }, from), chooseArrival(0, { yaw: 2, pitch: 0.2 }, from)]"
-    )
-    away, kept = run(node, tmp_path, header, arrive, 2)
-    assert (away, kept) == ({"yaw": pytest.approx(1 + math.pi), "pitch": 0}, {"yaw": 2, "pitch": 0.2})
-    unknown, _ = run(node, tmp_path, header, arrive, 1)
-    assert unknown == {"yaw": pytest.approx(find_turned(outlook)[1][0]), "pitch": 0}, "of another world, without a link"
+    assert found == [[0.4, 0.3], [2, 0], [0.4, 0.3], [1 + math.pi, 0], [0.4, 0.3], [0.4, 0.3]]
+
+
+def test_a_camera_stays_at_photographs_without_gaussians(node: str, tmp_path: Path) -> None:
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"limits": [0, 2]}
+    program = f"""() => {{
+        {SORTED}
+        walk(0.1, 0, 0.1);
+        return [camera.position, cameraFor({{ position: [0.3, 0, 1.2] }}).position, isFixed()];
+    }}"""
+    assert run(node, tmp_path, header, program) == [[0, 0, 0], [0, 0, 2], True], "a script places it at one, too"
 
 
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
