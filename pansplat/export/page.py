@@ -53,7 +53,7 @@ from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, link_parts
-from pansplat.tours.outlook import find_turned
+from pansplat.tours.outlook import find_widest
 from pansplat.tours.route import find_angles
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
@@ -263,7 +263,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
     """Yaw and pitch of the start view of a panorama, else of its widest view."""
     start = tour.find_start_view(view)
-    return find_turned(facts.outlooks[view], None if start is None else find_angles(facts.level.T @ start))[1]
+    return (find_widest(facts.outlooks[view]), 0.0) if start is None else find_angles(facts.level.T @ start)
 
 
 def _order_views(scene: Scene, flights: _Flights) -> list[int]:
