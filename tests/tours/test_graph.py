@@ -284,7 +284,7 @@ def test_links_of_a_scene_lead_to_their_ends_whatever_the_titles_are():
     assert tuple(panorama.title for panorama in tour.panoramas) == titles
 
 
-def test_a_panorama_at_an_approximate_place_is_drawn_there_and_stays_where_no_camera_flies(home):
+def test_a_panorama_at_an_approximate_place_is_shown_there_and_stays_where_no_camera_flies(home):
     """p3 is 1 m to the right and 2 m ahead of p2, and is turned by a quarter to the right."""
     about = ApproximatePlace(home.panoramas[2].image, 1.0, 2.0, math.pi / 2, ("p2",))
     panoramas = list(home.panoramas)
@@ -295,8 +295,8 @@ def test_a_panorama_at_an_approximate_place_is_drawn_there_and_stays_where_no_ca
         assert list(drawn.approximate) == [3] and drawn.approximate[3].beside == 2
         axes = drawn.level_axes[:, (0, 2)]
         places = drawn.positions[3] @ axes + np.array(((0, 0), (0, 1), (1, 0)))  # the camera, ahead, to the right
-        assert np.allclose(drawn.draw(3, places), drawn.positions[2] @ axes + np.array(((1, 2), (2, 2), (1, 1))))
-        assert np.array_equal(drawn.draw(4, places), places)
+        shown = drawn.approximate[3].move(places)
+        assert np.allclose(shown, drawn.positions[2] @ axes + np.array(((1, 2), (2, 2), (1, 1))))
         assert drawn.parts == home.parts and not drawn.is_placed(3)
         assert np.allclose(drawn.positions, home.positions) and drawn.overlaps == home.overlaps
     assert graph.select_views(scene, (3,)).approximate == ()
