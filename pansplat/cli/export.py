@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pansplat.inputs.pairs import Pair
 
 _INDEX_NAME = "index.html"  # name of the page in a folder
-_MIN_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # for each panorama: fewer are noted; suggested
+_MIN_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # for each panorama: least without a note; suggested
 _MAX_GAUSSIANS = 2_000_000  # most Gaussians that the note suggests for a page in one file
 _GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
 _MIN_POINT_OPACITY, _MAX_POINTS = 0.1, 200_000  # points of a training set: least opacity, and their number

@@ -27,7 +27,7 @@ from pansplat.images.image_files import list_masks, read_thumbnail
 Array = NDArray[Any]
 
 _HEIGHT = 256  # pixels; height of the panoramas for detection
-_MAX_IMAGES = 16  # of a long sequence, so many evenly spaced panoramas are compared
+_MAX_IMAGES = 16  # evenly spaced panoramas of a long sequence that are compared
 _MIN_DIFFERENCE = 0.02  # mean grey difference; two panoramas with less count as taken at one place
 
 _SAMPLE_DEGREES = 0.5  # degrees between samples of the polar maps
@@ -48,7 +48,7 @@ _MIN_VIEWS_FOR_LEGS = 4  # with fewer panoramas too many edges are static by cha
 _LEG_RADIUS, _LEG_SHIFT, _LEG_GAP = 5, 5, 7  # samples: half thickness, shift between views, largest interruption
 _LEG_CONTRAST = 0.045  # grey difference to the floor
 _REGION_MARGIN = 3  # samples added around the region, because its edge is blurred
-_LEAST_COLOR = 1e-6  # value in [0, 1] of black surfaces, which black masks leave visible; less than any display shows
+_LEAST_COLOR = 1e-6  # value in [0, 1] that black surfaces get, which are no holes then; less than any display shows
 
 
 def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "height width"]:

@@ -33,7 +33,7 @@ from pansplat.sweep.surface import (
 )
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
-_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
+_MAX_VARIANCE = 4e-3  # largest variance of grey values that raises a weight; more texture has no more
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the usual one

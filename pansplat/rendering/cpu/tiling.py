@@ -123,7 +123,7 @@ def _is_outside(n, p, q, radial_variance, kappa, normal_x, normal_y, normal_z):
 @kernel
 def _bound_pinhole(records, rotation, height, width, focal, boxes, item):
     rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
-    tan_x, tan_y = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))  # of half the field of view
+    tan_x, tan_y = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))  # tangents of half the field
     middle_x, middle_y, scale = np.float32(0.5 * width), np.float32(0.5 * height), np.float32(focal)
     num = len(records) // layout.RECORD_SIZE
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
@@ -533,7 +533,7 @@ def intersect_tiles(
 # the same distance, a radix sort by all digits replaces it; its time does not depend on the distances.
 
 _MAX_DIGIT_BITS = 11  # 2048 counters fit the L1 cache
-_EXTRA_BITS = 3  # added to half the bits of a tile's indices, a digit leaves few intersections out of order
+_EXTRA_BITS = 3  # bits of a digit beyond half those of an index in the tile: few intersections stay out of order
 _MAX_MOVES = 4  # average moves of an intersection by insertion before radix sort replaces it
 _READ_AHEAD = 32  # intersections between the prefetch of a distance and its use
 _ROUNDING_BITS = 12  # lowest bits of a distance, ignored: equal distances, computed in other steps, may differ in these
