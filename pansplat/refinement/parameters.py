@@ -14,10 +14,10 @@ from pansplat.geometry.pose import invert_pose, multiply_quats, quats_from_rotat
 
 _MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY = 1e-3, 0.999  # the logits of opacities are refined between these
 # Largest decrease and increase of the logarithms of distances and scales, of quaternions, and of logits. Without them
-# exposures and wrong shapes are explained by veils and specks between the cameras, which no photograph shows.
+# exposures and wrong shapes are explained by veils and specks between the cameras (docs/refinement.md).
 _BOUNDS = {"distance": (0.1, 0.1), "scale": (3.0, 0.3), "rotation": (1.0, 1.0), "opacity": (10.0, 0.7)}
 _LAYER_FREEDOM = 3.0  # factor of the bounds for Gaussians that are drawn without those of other views
-_FREE_PARALLAX = 0.7  # baseline over distance above which bounds fall with its fourth power
+_FREE_PARALLAX = 0.7  # baseline over distance above which bounds fall with its fourth power (docs/refinement.md)
 _MIN_SCALE = 1e-9  # smallest scale, relative to the distance
 _MIN_DISTANCE = 1e-6  # smallest distance from the source camera, metres
 _SPLIT_SHIFT, _SPLIT_SCALE = 0.5, 0.7  # halves of a split Gaussian: shift and scale along its longest axis, in scales

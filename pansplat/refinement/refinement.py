@@ -50,9 +50,9 @@ from pansplat.system.source_hash import hash_sources
 DISPLAY_HEIGHT = 1024
 _CONTRIBUTION_HEIGHT = 512  # largest height of the images by which Gaussians are merged and dropped
 _HELD_OUT = 0.04  # fraction of the photographs' blocks that is not fitted until the release
-_SPLIT_ERROR = 0.1  # absolute errors times blending weights, in pixels, that sum to more split a Gaussian
-# Decay of Adam's averages of the gradients and of their squares: short ones, since a run has tens of steps. Wrong poses
-# need long ones: own and other photographs contradict each other until the poses are corrected.
+_SPLIT_ERROR = 0.1  # pixels; a larger sum of errors times weights splits a Gaussian (docs/refinement.md)
+# Decay of Adam's averages of the gradients and of their squares, by docs/what_was_tried.md. Wrong poses need long ones:
+# own and other photographs contradict each other until the poses are corrected.
 _BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at their own
 # size; it grows with the number of their pixels. Gaussians of little effect move less.

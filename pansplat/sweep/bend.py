@@ -28,9 +28,9 @@ _MAX_DIFFERENCE = 0.12  # mean difference of colour of 5x5 pixels above which a 
 _FULL_PARALLAX = 0.25  # angle between the two rays to a point from which a match has full weight, radians
 
 # Fields, from the smoothest to the finest
-_SMOOTHNESS = (1e5, 3e3, 300.0, 30.0, 3.0)  # coupling of neighbouring pixels, relative to full evidence
+_SMOOTHNESS = (1e5, 3e3, 300.0, 30.0, 3.0)  # coupling of neighbouring pixels, in full evidence (docs/what_was_tried.md)
 _STIFFNESS = (0.0, 0.01, 0.02, 0.04, 0.05)  # evidence at which a field has half of its amplitude
-_OUTLIER = (1.0, 0.6, 0.3, 0.15, 0.06)  # deviation from a field, in log-depth, that halves the weight of a match
+_OUTLIER = (1.0, 0.6, 0.3, 0.15, 0.06)  # deviation in log-depth that halves the weight of a match; halls need the first
 _ITERATIONS = 2  # weightings of the matches by their deviation, for each field
 # Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence for
 # the field, above a difference that is no discontinuity.

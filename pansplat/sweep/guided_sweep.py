@@ -44,7 +44,7 @@ _KINDS: dict[type, tuple[str, type]] = {
     DepthSharpening: ("depth_sharpening", SharpeningConfig),
 }
 _PANORAMA_SECONDS = 1.0  # time that the networks take for a panorama on two cores
-_SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
+_SEARCH_HEIGHT = 384  # rows; 512 take 1.6 times as long, 256 break stems of lamps (docs/what_was_tried.md)
 
 
 def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | str | None = None) -> Sweep:

@@ -40,7 +40,7 @@ _HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the us
 _FLOOR_TOLERANCE = 0.15  # distance from the floor of pixels that the model places on it, in camera heights
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
 _MIN_SPREAD = 0.1  # least relative deviation of an estimate that decides what a view sees
-_MIN_OVERLAP = 0.5  # least overlap of views that are matched, as a fraction of the view
+_MIN_OVERLAP = 0.5  # least common fraction of the surfaces of views that are matched (docs/what_was_tried.md)
 _REFINEMENTS = 2  # refinements of the depth by comparison of the views
 
 # The cost of a prior, in the unit of the matching cost

@@ -56,8 +56,8 @@ _SMALL_HEIGHT = 96  # rows of the panoramas with which heights of the cameras ov
 
 _MAX_CANDIDATES = 256  # largest number of hypotheses of a set at the coarse level
 _NEAR_MARGIN = 0.75  # smallest searched depth, relative to `near`
-_FAR_MARGIN = 10.0  # largest searched depth, relative to `far`: rooms are often larger than the range that was given
-_NARROW_CANDIDATES = (16, 8)  # hypotheses of a set at the two finer levels
+_FAR_MARGIN = 10.0  # largest searched depth, relative to `far`: rooms are often larger (docs/adr/0011)
+_NARROW_CANDIDATES = (16, 8)  # hypotheses of a set at the two finer levels (docs/what_was_tried.md)
 _MAX_NEIGHBOURS = 3  # other views that a view is matched against
 
 # A search near the surfaces of single views: hypotheses by level, and largest relative change of inverse depth by level

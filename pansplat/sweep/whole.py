@@ -24,7 +24,7 @@ from pansplat.sweep.smoothing import as_meridians, smooth_sphere
 from pansplat.sweep.surface import nearest_pixel
 
 # Angles are in radians.
-_BASELINE_ANGLE = math.radians(1.5)  # standard deviation of the average at a distance equal to the baseline
+_BASELINE_ANGLE = math.radians(1.5)  # deviation of the average where depth is the baseline (docs/what_was_tried.md)
 _MAX_ANGLE = math.radians(4)
 _CROP_SHARE = 0.5  # height of the crops in which segments are found, relative to the panorama's
 _CONTRAST = 20, 60  # grey values up to 255; thresholds of Canny's edge detector
