@@ -113,7 +113,7 @@ def rotate_harmonics(
     """Coefficients of the same colours after a rotation of the world."""
     degree = math.isqrt(harmonics.shape[-2]) - 1
     matrix = rotation_matrices(rotation.double(), degree).to(harmonics)
-    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)  # a single matrix product
+    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)
 
 
 @functools.lru_cache

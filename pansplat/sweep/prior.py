@@ -44,8 +44,8 @@ _MIN_OVERLAP = 0.5  # least common fraction of the surfaces of views that are ma
 _REFINEMENTS = 2  # refinements of the depth by comparison of the views
 
 # The cost of a prior, in the unit of the matching cost
-_WEIGHT = 0.25  # matching cost of a deviation by one Laplace scale
-_CAP = 3.0  # deviation, in Laplace scales, above which the cost is constant
+_DEVIATION_COST = 0.25  # matching cost of a deviation by one Laplace scale
+_MAX_DEVIATION = 3.0  # deviation, in Laplace scales, above which the cost is constant
 _MIN_SCALE = 0.03  # smallest Laplace scale of log-depth
 _FURTHER_PENALTY = 0.25  # added to the deviation from each prior but the first, in Laplace scales
 
@@ -304,7 +304,7 @@ def apply_prior_cost(cost: np.ndarray, priors: Sequence[DepthPrior], sets: Seque
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, _MIN_SCALE) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, _FURTHER_PENALTY, 0).astype(np.float32)
-    weight, cap = np.float32(_WEIGHT), np.float32(_CAP)
+    weight, cap = np.float32(_DEVIATION_COST), np.float32(_MAX_DEVIATION)
     for n, hypotheses in enumerate(sets):
         base, step = (np.ascontiguousarray(each, np.float32) for each in (hypotheses.base, hypotheses.step))
         add = partial(_add_cost, cost, log_depth, scale, penalty, base, step, n * count, count, weight, cap)

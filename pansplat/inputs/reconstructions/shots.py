@@ -33,7 +33,7 @@ from pansplat.system.files import make_unique_name
 
 Vector = tuple[float, float, float]
 
-_SCALE = "scale.txt"
+_SCALE_FILE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
 _RIG_SIZE = 1e-3  # distance of cameras of one rig, over the median distance of cameras from their mean
 _LOCAL_ROUNDING, _FAR_ROUNDING = 1e-5, 1e-9  # rounding: over distances from the mean; from the origin
@@ -166,12 +166,12 @@ def make_collection(found: Reconstruction) -> Collection:
             stacklevel=4,
         )
     places = dict.fromkeys((found.source.parent, found.folder))
-    scale_file = next((place / _SCALE for place in places if (place / _SCALE).is_file()), None)
+    scale_file = next((place / _SCALE_FILE for place in places if (place / _SCALE_FILE).is_file()), None)
     scale = 1.0 if scale_file is None else read_number(scale_file)
     if scale_file is None and not found.is_metric:
         warnings.warn(
             f"{found.source}: the unit of its poses is arbitrary and is taken as a metre; write metres per unit into "
-            f"{found.folder / _SCALE}.",
+            f"{found.folder / _SCALE_FILE}.",
             InputWarning,
             stacklevel=4,
         )
