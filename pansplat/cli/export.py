@@ -98,6 +98,8 @@ class Page:
     """Then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
     title: str | None = None
     """Title of the page; by default the name of the scene."""
+    address: str | None = None
+    """Address that a folder will have on the web (https://...), for the picture in previews of links to it."""
 
     def write(self, export: Export) -> None:
         """Write the page, print its size, and serve it."""
@@ -105,6 +107,9 @@ class Page:
         from pansplat.export.page_server import serve_page
 
         out, split = export.out, not export.out.suffix
+        if self.address is not None and not (split and self.address.startswith(("http://", "https://"))):
+            wrong = f"{self.address!r} for {out}"
+            raise InputError(f"--address: needed https://... and a folder, got {wrong}; give a whole address and NAME/")
         if split:
             require_output_folder("--out", out)
             require_replaceable("--out", [out / _INDEX_NAME], export.overwrite)
@@ -122,6 +127,7 @@ class Page:
                 gaussians=count,
                 split=split,
                 title=self.title or _name_page(export.path, photographs),
+                address=self.address,
                 photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
             )

@@ -124,6 +124,13 @@ def read_height(path: Path | str) -> int:
     return read_size(path)[1]
 
 
+def read_face_size(path: Path | str) -> int:
+    """Size of a cube face that has the detail of an image file, pixels: that of the file's faces, else with as many
+    pixels for an angle in its middle as the panorama, width / pi. No pixels are decoded."""
+    path = Path(path)
+    return read_cube(path).levels[-1].size if path.name.endswith(CUBE_SUFFIX) else int(2 * read_height(path) / math.pi)
+
+
 def read_size(path: Path | str) -> tuple[int, int]:
     """Width and height of an image file, pixels; see `read_height`."""
     path = Path(path)

@@ -192,6 +192,7 @@ class DisplayScene:
         selection: Selection | None = None,
         cache: SelectionCache | None = None,
         min_transmittance: float = MIN_TRANSMITTANCE,
+        shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> Layers:
         """Rasterise the layers of an image plane.
 
@@ -204,6 +205,7 @@ class DisplayScene:
             selection: leaves out Gaussians that are not in view.
             cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
+            shift: see `project_gaussians`.
         """
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
@@ -223,7 +225,7 @@ class DisplayScene:
                         cache.selected = self._select_around(*of_view)
                     gaussians, ends = cache.selected.gaussians, cache.selected.ends
             with statistics.timed("project"):
-                projected = project_gaussians(gaussians, camera, workspace, threads)
+                projected = project_gaussians(gaussians, camera, workspace, threads, shift)
             start = 0
             for end, layer_sums in zip(ends, sums, strict=True):
                 part = slice(start, end)
