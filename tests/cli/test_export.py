@@ -103,7 +103,7 @@ def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(
     for _ in range(2):  # a page of ours is replaced
         assert run([*command, str(out)]) == 0
     printed = capsys.readouterr().out
-    assert f"{out / 'index.html'} and 21 files in index_files/" in printed and "3 photographs of 64 rows" in printed
+    assert f"{out / 'index.html'} and 22 files in index_files/" in printed and "3 photographs of 64 rows" in printed
     assert '"folder": "index_files"' in (out / "index.html").read_text()
     for options in (["--photo-height", "0"], ["--crop", "-9", "-9", "-9", "9", "9", "9"]):
         assert run([*command, str(tmp_path / "page.html"), *options]) == 0

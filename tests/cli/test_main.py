@@ -151,7 +151,6 @@ REFUSED = {
     "export room -o x --training-set --points": "--points is for a .ply",
     "export scene.ply -o x.ply --crop a 0 0 1 1 1": "--crop",
     "export scene.ply -o x.ply --layers --crop 50 50 50 60 60 60": "scene.ply: needed a box with Gaussians, got (50.00",
-    "export scene.ply -o x.png": "needed a floor, and walls around at least one of 2 input cameras",
     "export scene.ply -o x --training-set": "needed the folder of the panoramas to write their cube faces",
     "export room -o room --training-set": "needed a new or empty folder, got one with files",
     "export room -o x --training-set --crop 0 0 0 1 1 1": "--remove-floaters are not for a folder to train from",

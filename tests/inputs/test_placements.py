@@ -29,7 +29,8 @@ def test_an_approximate_place_is_as_far_away_in_every_unit_of_measured_poses(tmp
         (folder / "poses.json").write_text(json.dumps(content))
         with pytest.warns(InputWarning, match=r"no pose of c\.png"):
             (tour,) = find_tours(load_pairs(folder))
-        drawn = tour.approximate[2]
-        assert tour.panoramas[2].name == "c" and np.linalg.norm(drawn.place - tour.positions[0, [0, 2]]) == approx(3)
+        centers = tour.positions @ tour.level_axes[:, (0, 2)]
+        away = tour.approximate[2].move(centers[2]) - centers[0]
+        assert tour.panoramas[2].name == "c" and np.linalg.norm(away) == approx(3)
         scene = merge_scenes(tour, lambda v, t=tour: Scene(empty_gaussians(), t.cam2world[list(v)], 1.0, 9.0))
         assert scene.approximate[0][:4] == (2, 0, approx(0), approx(3 * unit))

@@ -13,20 +13,20 @@ from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.tour import TourScenes
 
-_RADIUS = 0.22  # metres, on the floor
+_RADIUS = 0.22  # metres
 _MIN_PIXELS = 14.0  # of the radius within which a click is meant
 
 
 @dataclass(frozen=True)
 class Hotspot:
-    """The place of a panorama in the image, on the floor below its camera, or on the floor where a link leads to it.
+    """The place of a panorama in the image, on the floor below its camera, or where a link leads to it.
 
     Attributes:
         node: number of the panorama.
         label: its name, or the text of the link.
         center: pixels, from the left and from the top.
         radius: pixels, within which a click is meant.
-        ring: corners of the circle on the floor, pixels.
+        ring: corners of the circle on the floor, or upright on a wall, pixels.
         is_fade: whether the panorama is in another part, to which the image fades.
     """
 
@@ -60,7 +60,8 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
                 feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
     found = []
     for node, (foot, label) in feet.items():
-        hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=tour.is_fade(scenes.edge[0], node))
+        is_fade, is_upright = tour.is_fade(scenes.edge[0], node), bool((foot - position - below) @ below < -1e-6)
+        hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=is_fade, is_upright=is_upright)
         if hotspot is not None:
             found.append((float(np.linalg.norm(foot - position)), hotspot))
     return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
@@ -74,11 +75,14 @@ def _make_hotspot(
     foot: Float[np.ndarray, "3"],
     *,
     is_fade: bool,
+    is_upright: bool,
 ) -> Hotspot | None:
-    """The hotspot of a panorama around a place on the floor; None if it is not in an image of this size."""
-    right, _, forward = np.asarray(camera.level).T
+    """The hotspot of a panorama around a place on the floor or a wall; None if it is not in an image of this size."""
+    right, down, forward = np.asarray(camera.level).T
+    across, along = (np.cross(down, foot - camera.position), down) if is_upright else (right, forward)
     angles = np.arange(24) * (2 * np.pi / 24)
-    circle = foot + _RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
+    circle = np.cos(angles)[:, None] * (across / np.linalg.norm(across)) + np.sin(angles)[:, None] * along
+    circle = foot + _RADIUS * circle
     center = project_point(camera, tuple(foot), size)
     ring = [project_point(camera, tuple(corner), size) for corner in circle]
     if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):

@@ -12,7 +12,7 @@ from pansplat_viewer.scene.hotspots import find_clicked, find_hotspots
 from pansplat_viewer.scene.tour import TourScenes
 
 
-def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_house):
+def test_the_hotspot_of_a_link_is_where_it_meets_the_floor_or_a_wall(parted_house, load_house):
     scenes = TourScenes(parted_house)
     scenes.add(load_house(scenes.make_entry((1, 2))))
     scenes.move(parted_house.positions[2])
@@ -22,16 +22,17 @@ def test_the_hotspot_of_a_link_is_where_it_meets_the_floor(parted_house, load_ho
     focal = 100 / np.tan(np.radians(60))
     assert hotspot.center == pytest.approx((100 + focal * np.tan(0.1), 100 + focal * np.tan(0.6) / np.cos(0.1)))
     scenes.move(parted_house.positions[3])
-    for pitch, distance in ((1.4, 1.0), (0.05, 3.0), (-0.2, 3.0)):
+    for pitch, slope in ((1.4, 1.0), (0.05, np.tan(0.05)), (-0.2, np.tan(-0.2))):  # on the floor, on a wall 3 m away
         panoramas = list(parted_house.panoramas)
         panoramas[3] = replace(panoramas[3], links=(Link("room2", 0.0, pitch),))
         scenes.tour = replace(parted_house, panoramas=tuple(panoramas))
         (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
-        assert hotspot.center == pytest.approx((100, 100 + focal / distance)), "1 to 3 m away"
-        assert hotspot.label == "room2"
+        assert hotspot.center == pytest.approx((100, 100 + focal * slope)) and hotspot.label == "room2"
+        width, height = np.ptp(hotspot.ring, axis=0)
+        assert (height == pytest.approx(width, rel=0.01)) == (pitch < 1), "a ring on a wall is upright"
     scenes.outlooks[3] = np.full(BINS, 2.0)
     (hotspot,) = find_hotspots(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
-    assert hotspot.center == pytest.approx((100, 100 + focal / 1.6)), "before a wall"
+    assert np.ptp(hotspot.ring, axis=0)[0] == pytest.approx(1.5 * width, rel=0.05), "a nearer wall"
 
 
 def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(house, load_house):
