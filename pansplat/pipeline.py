@@ -29,7 +29,7 @@ from pansplat.geometry.pose import blend_weights
 from pansplat.inputs import folders
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import ONE_POSITION, Views
-from pansplat.model.weights import WEIGHTS_SUFFIXES, read_model_name
+from pansplat.networks.weights import WEIGHTS_SUFFIXES, read_model_name
 from pansplat.poses.estimate import estimate_poses
 from pansplat.poses.files import estimate_pairs
 from pansplat.prediction_options import CompatChoice, Precision, PredictOptions, choose_caches

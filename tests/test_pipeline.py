@@ -21,7 +21,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.inputs.pairs import Pair
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load, load_pairs, predict, predict_to_file, predict_tour, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize

@@ -139,6 +139,11 @@ def test_an_installed_wheel_needs_its_dependencies_only(installed: Path, tmp_pat
         assert len(list(film.decode(video=0))) > 1
 
 
+def test_the_installed_numba_is_within_an_upper_bound() -> None:
+    (numba,) = (each for each in map(Requirement, PROJECT["dependencies"]) if each.name == "numba")
+    assert importlib.metadata.version("numba") in numba.specifier and "99" not in numba.specifier
+
+
 def test_setup_pins_every_direct_dependency() -> None:
     constraints = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {line.split("==")[0] for line in constraints if line and not line.startswith("#")}

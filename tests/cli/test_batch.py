@@ -24,7 +24,7 @@ from pansplat import pipeline
 from pansplat.cli import batch, run
 from pansplat.cli.batch import REPORT_NAME, Batch, fingerprint_work, list_items, process_item
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.prediction_options import PredictOptions
 
 HEIGHT = 64

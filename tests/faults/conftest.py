@@ -19,7 +19,7 @@ from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.gaussians.scene import Scene
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.training.__main__ import run as run_training
 from pansplat_viewer import run as run_viewer
 
