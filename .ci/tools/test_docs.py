@@ -35,7 +35,6 @@ def test_calls_of_the_readme_exist() -> None:
     calls = set(re.findall(r"pansplat\.(\w+)\(", README))
     assert calls >= {"predict", "render", "load_model", "rasterize", "save", "load"} and calls <= set(pansplat.__all__)
     assert all(callable(getattr(pansplat, name)) for name in pansplat.__all__)
-    assert set(pansplat.pipeline.__all__) <= set(pansplat.__all__)
     pictures = re.findall(r"^(?:image|picture) = pansplat\.(\w+)\(.*\)\.color", README, re.MULTILINE)
     assert pictures == ["render", "rasterize"], "a tensor, not a `Rendering`"
 

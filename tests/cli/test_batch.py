@@ -34,7 +34,7 @@ SPHERE = PredictOptions("sphere", height=HEIGHT, refine_steps=0)
 @pytest.fixture
 def sphere(sphere_predictor: type, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """`--model sphere` in this process."""
-    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    monkeypatch.setitem(pipeline.models._MODELS, "sphere", sphere_predictor)
     fingerprint_work.cache_clear()
     yield
     fingerprint_work.cache_clear()

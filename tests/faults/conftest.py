@@ -76,7 +76,7 @@ def folder(tmp_path: Path, originals: Path, monkeypatch: pytest.MonkeyPatch, sph
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    monkeypatch.setitem(pipeline.models._MODELS, "sphere", sphere_predictor)
     return work
 
 

@@ -64,7 +64,7 @@ def test_a_change_of_a_source_that_computes_a_result_changes_its_fingerprint(cop
 @pytest.mark.parametrize("result", FINGERPRINTS)
 def test_a_change_of_a_command_keeps_fingerprints(copied, result):
     before = FINGERPRINTS[result]()
-    for source in ("cli/render.py", "__init__.py", "pipeline.py"):
+    for source in ("cli/render.py", "__init__.py", "pipeline/prediction.py"):
         change(copied / source)
     assert FINGERPRINTS[result]() == before
 
