@@ -6,6 +6,7 @@ uniform sampler2D photograph;       // equirectangular, top row first
 uniform bool shows_photograph;
 uniform vec2 tangent;               // of half the horizontal and vertical field of view
 uniform mat3 camera_to_photo;       // rotation, OpenCV axes
+uniform vec3 beside;                // from the photograph's camera, over the distance of surfaces; its axes
 
 in vec2 uv;
 
@@ -20,7 +21,7 @@ vec3 sample_image() {
 
 vec3 sample_photograph() {
     vec2 ray = (2.0 * uv - 1.0) * tangent;
-    vec3 d = camera_to_photo * vec3(ray.x, -ray.y, 1.0);
+    vec3 d = camera_to_photo * normalize(vec3(ray.x, -ray.y, 1.0)) + beside;
     vec2 photo_uv = vec2(atan(d.x, d.z) / (2.0 * PI) + 0.5, atan(d.y, length(d.xz)) / PI + 0.5);
     return textureLod(photograph, photo_uv, 0.0).rgb;  // level 0: derivatives have a seam at +-180 degrees
 }

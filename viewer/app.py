@@ -71,7 +71,7 @@ class Options:
     size: str | None = None
     """Width x height, pixels (window 1280x720, film 1920x1080)."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Length of the film (4); of a tour, by default the time at 1 metre per second."""
+    """Length of the film (4); of a tour, by default that of the ways through all panoramas."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of the film."""
 

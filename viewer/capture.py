@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,8 +17,7 @@ from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, write
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
-from pansplat.tours.graph import TourGraph
-from pansplat.tours.route import FADE_SECONDS, NEAR_OF_FAR, Route, plan_route
+from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, make_file_name
@@ -27,7 +27,6 @@ from pansplat_viewer.scene.tour import TourScenes
 
 FIELD_OF_VIEW = 75.0  # of flights, vertical, degrees
 STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
-_FADING_COST = 0.2  # of a still in the first moment of a fade, as a distance from the panorama, fraction of far
 
 
 def compute_flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
@@ -126,10 +125,11 @@ def write_flight(
         for still in STILLS:
             stills.setdefault(round(still * (len(shots) - 1)), []).append(f"view_{round(100 * still):03d}.png")
     else:
-        tour, route = scenes.tour, plan_route(scenes.tour, scenes.tour.plan_walk())
+        tour, route = scenes.tour, plan_route(scenes.tour, scenes.tour.plan_walk(), rest=REST_SECONDS)
         shots = list_flight(route, fps, FIELD_OF_VIEW, seconds)
-        for frame, nodes in find_nearest_frames(tour, route, shots).items():
-            stills[frame] = [f"{node + 1:02d}_{make_file_name(tour.panoramas[node].label)}.png" for node in nodes]
+        for node, at in route.visits.items():
+            still = f"{node + 1:02d}_{make_file_name(tour.panoramas[node].label)}.png"
+            stills.setdefault(math.ceil(at * (len(shots) - 1)), []).append(still)
 
     def show(number: int, color: np.ndarray) -> None:
         for name in stills.get(number, ()):
@@ -143,17 +143,3 @@ def write_flight(
         file = folder / f"panorama_{round(100 * at):03d}.png"
         write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=settings.mode).color)
         show_file(file)
-
-
-def find_nearest_frames(tour: TourGraph, route: Route, shots: Sequence[Shot]) -> dict[int, list[int]]:
-    """The nodes of a tour by the frame of the flight that is near them, and in which no other image fades out."""
-    path, seconds = np.array([shot.pose[:3, 3] for shot in shots]), np.array([shot.seconds for shot in shots])
-    fading = np.zeros(len(path))
-    for jump in route.jumps:
-        since = seconds - jump / (len(route.yaws) - 1) * route.seconds
-        fading = np.maximum(fading, np.where(since > 0, 1 - since / FADE_SECONDS, 0.0))
-    frames: dict[int, list[int]] = {}
-    for node, position in enumerate(tour.positions):
-        cost = np.linalg.norm(path - position, axis=1) + _FADING_COST * tour.far * fading
-        frames.setdefault(int(cost.argmin()), []).append(node)
-    return frames

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
+from pansplat.inputs.pairs import Panorama
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import plan_route
 from pansplat_viewer.scene import camera as cameras
@@ -320,7 +322,7 @@ class Scenes:
 
     def _preview(self, entry: SceneEntry) -> None:
         """Show the photographs of an entry until its scene is there; the camera can turn and fly."""
-        photographs = self._stage.photographs
+        photographs, view = self._stage.photographs, self._find_view()
         photographs.open(entry.panoramas)
         self._stage.clear()
         self.tour = None
@@ -336,11 +338,29 @@ class Scenes:
         else:
             enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
             self.tour = TourScenes(entry.tour)
+        self._keep_view(view, entry.panoramas)
         nearest = photographs.find_nearest(np.asarray(self._state.camera.position))
         if nearest is not None:
             photographs.wait(nearest)  # else the first frames are black
             self._face_open_view(entry, nearest)
         self._stage.last_camera = self._state.camera
+
+    def _find_view(self) -> tuple[Path, np.ndarray] | None:
+        """The photograph at the camera, and where the camera looks in it; None at none."""
+        photographs, camera = self._stage.photographs, self._state.camera
+        index = photographs.find_stop(np.asarray(camera.position))
+        if index is None:
+            return None
+        return photographs.panoramas[index].image, photographs.pose(index)[:3, :3].T @ camera.rotation[:, 2]
+
+    def _keep_view(self, view: tuple[Path, np.ndarray] | None, panoramas: Sequence[Panorama]) -> None:
+        """Look at the same place of the same photograph, whose pose may be another one."""
+        for each in panoramas:
+            if view is not None and each.image == view[0]:
+                camera, pose = self._state.camera, each.cam2world.double().numpy()
+                moved = replace(camera, position=tuple(pose[:3, 3].tolist()))
+                turned = cameras.focus_on_point(moved, pose[:3, 3] + pose[:3, :3] @ view[1])
+                self._state.camera = replace(turned, distance=camera.distance)
 
     def _face_open_view(self, entry: SceneEntry, index: int) -> None:
         """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""
@@ -369,7 +389,7 @@ class Scenes:
     def _list_remaining(self) -> tuple[int, ...]:
         """The panoramas that a flight through a tour still visits; none if there is no flight."""
         route, state = self._state.route, self._state
-        return route.walk[route.leg(state.flight) + 1 :] if route is not None and state.playing else ()
+        return route.list_remaining(state.flight) if route is not None and state.playing else ()
 
     def update(self) -> None:
         """Show the scene of the camera's place, and load those that are next."""
@@ -377,7 +397,7 @@ class Scenes:
         if tour is None:
             return
         route = state.route if state.playing else None
-        tour.move(np.asarray(state.camera.position), None if route is None else route.edge(state.flight))
+        tour.move(np.asarray(state.camera.position), None if state.moment is None else state.moment.step.edge)
         state.tour = tour.tour  # poor edges and walls are found later
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)
@@ -414,11 +434,12 @@ class Scenes:
                 if state.flight == 0:
                     state.route = tour.plan_route(pose)
                 elif not np.allclose(pose, state.route.pose(state.flight), atol=1e-4):
-                    state.route = tour.plan_route(pose, state.route.walk[state.route.leg(state.flight) + 1 :])
+                    state.route = tour.plan_route(pose, state.route.list_remaining(state.flight))
                     state.flight = 0.0
             state.target = None
             if state.playing:  # photographs are read before they are shown
-                leg = state.route.leg(state.flight)
-                for node in state.route.walk[leg + 1 : leg + 3]:
+                for node in state.route.list_remaining(state.flight)[:2]:
                     self._stage.get_photograph(node)
+                if state.moment is not None and state.moment.arrival is not None and self._stage.photographs.is_reading:
+                    return
         advance_flight(state, seconds)

@@ -153,8 +153,10 @@ class Viewer:
         camera, fade = self.state.camera, self.stage.fade
         size = imgui.get_io().display_size
         points = int(size.x), int(size.y)
-        has_arrived = self.scenes.tour is not None and fade.parts[fade.front] == self.scenes.tour.part
-        return find_hotspots(self.scenes.tour, camera, points) if self.scenes.tour is not None and has_arrived else []
+        tour, moment = self.scenes.tour, self.state.moment
+        if tour is None or fade.parts[fade.front] != tour.part or (moment is not None and moment.arrival is not None):
+            return []
+        return find_hotspots(tour, camera, points)
 
     # --- frames ---
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pansplat.tours.route import Route
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
-_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # pixels
+_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # rows of a video: perspective, and panoramic
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Render(Computation):
     fov: Annotated[float, Meta(ge=1, le=170)] = 90.0
     """Vertical field of view of `perspective`, degrees."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Length of a video; 4 by default, for a tour of several parts that of the flight at 1 m/s."""
+    """Length of a video; 4 by default, for a tour that of the ways through all panoramas."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of a video."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
@@ -157,7 +157,7 @@ class Render(Computation):
     def _pose_between_cameras(self, scene: Scene) -> Tensor:
         import torch
 
-        fraction, route = 0.5 if self.at is None else self.at, _plan_flight(scene)
+        fraction, route = 0.5 if self.at is None else self.at, _plan_route(scene)
         return scene.pose_between(fraction) if route is None else torch.from_numpy(route.pose(fraction))
 
     def _list_shots(self, scene: Scene, path: CameraPath | None) -> list[Shot]:
@@ -170,7 +170,7 @@ class Render(Computation):
             return follow_path(path, self.fps, scene, make_graph(scene) if scene.overlaps else None)
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
-        flight = _plan_flight(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
+        flight = _plan_route(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
         return list_flight(flight, self.fps, self.fov, self.seconds)
 
     def _make_film(self, scene: Scene, source: Pair | None, options: dict[str, Any], count: int) -> Film:
@@ -189,7 +189,7 @@ class Render(Computation):
 
         @functools.lru_cache(maxsize=2)
         def renderer(shown: Scene) -> Callable[..., Rendering]:
-            work = 0 if self.stereo else count  # a card has no kernels of stereo
+            work = 0 if self.stereo else count  # stereo has no kernels for a card
             return pipeline.make_renderer(shown, "film", work, near=near, **options)
 
         @torch.no_grad()
@@ -203,15 +203,15 @@ class Render(Computation):
         return Film(choose, draw, "pinhole" if is_perspective else "equirect", options["size"], photographs)
 
 
-def _plan_flight(scene: Scene) -> Route | None:
-    """The flight through a tour of several parts; None for another scene. Between parts there is nothing to see."""
+def _plan_route(scene: Scene) -> Route | None:
+    """The way through a tour; None for another scene."""
     from pansplat.tours.graph import make_graph
-    from pansplat.tours.route import plan_route
+    from pansplat.tours.route import REST_SECONDS, plan_route
 
     if not scene.overlaps:
         return None
     tour = make_graph(scene)
-    return plan_route(tour, tour.plan_walk()) if max(tour.parts) else None
+    return plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
 
 
 def read_pose(path: Path) -> Tensor:

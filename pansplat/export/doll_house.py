@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,7 +42,8 @@ _BEHIND = 0.4  # farthest room behind a door, and distance of the two sides of a
 _THICK = 0.07  # of the walls, seen from above
 _STEP = 0.06  # between two places where cameras are compared
 _SOFT, _WIDE = 1.0, 4.0  # of these places: where one camera replaces another; over which hidden ones are averaged
-_TRIPOD, _AWAY = 0.3, 3.0  # radius of the floor around a camera, which another camera shows, if it is not farther
+_TRIPOD = 0.35  # radius of the floor around a camera, which its photograph does not show
+_EDGE, _EDGE_SOFT = 0.05, 0.03  # of a wall's width beside an unseen wall; of its height over which colours are averaged
 _GRAZING, _ASIDE = 0.02, 0.05  # least cosine between a ray and the normal of a surface; from a wall to where it is seen
 _THROUGH, _OPEN = 1.3, 0.6  # of the distance of a wall that a camera sees through; share of its places
 _HIDDEN = 4.0  # factor of the distance of a camera whose surfaces are in front
@@ -84,11 +86,14 @@ class DollHouse:
     """Triangles with a texture.
 
     Attributes:
+        nodes: the views of each house, and of rooms beside it: what their surroundings are turned by, radians to the
+            right, and where the camera is then, in the world.
         corners: of the triangles of each house, clockwise as their room shows them: place in the world, and u and v in
             the atlas, 0 to 1, v down; of tops of walls 2 + the normal of the wall, to the right and forward.
         atlas: WebP; empty without houses.
     """
 
+    nodes: tuple[dict[int, tuple[float, Float[np.ndarray, "3"]]], ...]
     corners: tuple[Float[np.ndarray, "corner 5"], ...]
     atlas: bytes
 
@@ -119,8 +124,12 @@ def build_panels(rooms: Rooms, is_open: Callable[[int, np.ndarray, float], bool]
                 gaps.append((room, ground, step, height))
         closed = every.buffer(_BEHIND / 2 * unit, join_style="mitre").buffer(-_BEHIND / 2 * unit, join_style="mitre")
         for room, shape in shapes.items():
-            sills = [ground.intersection(closed).difference(every) for owner, ground, _, _ in gaps if owner == room]
-            shape_with_sills = shapely.union_all([shape, *sills]).buffer(0)
+            sills = [
+                (ground.intersection(closed).difference(every), h) for owner, ground, _, h in gaps if owner == room
+            ]
+            shape_with_sills = shapely.union_all([shape, *(sill for sill, _ in sills)]).buffer(0)
+            for sill, height in sills:
+                panels += _raise_jambs(sill, every, (height, floor, _THICK * unit), house, room)
             every = every.union(shape_with_sills)
             panels.append(_lay_floor(shape_with_sills, floor, house, room))
             panels += _raise_walls(shape, gaps, (top, floor, _THICK * unit), house, room)
@@ -138,6 +147,24 @@ def _lay_floor(shape: shapely.Geometry, height: float, house: int, room: int) ->
     flat = shapely.transform(shape, lambda places: places @ axes - low)
     right, down, origin = (np.array((x, 0.0, z)) for x, z in (*axes.T, axes @ low))
     return Panel(origin + height * np.array((0, 1, 0)), right, down, flat, house, room)
+
+
+def _raise_jambs(
+    sill: shapely.Geometry, rooms: shapely.Geometry, sizes: tuple[float, float, float], house: int, room: int
+) -> Iterator[Panel]:
+    """The sides of a passage, which no room has. Sizes: heights of their tops and the floor (downwards), thickness."""
+    top, floor, thickness = sizes
+    for piece in shapely.get_parts(shapely.orient_polygons(sill)):
+        for start, end in pairwise(np.array(piece.exterior.coords) if isinstance(piece, Polygon) else ()):
+            if rooms.distance(shapely.Point((start + end) / 2)) > 0.3 * thickness:
+                yield _stand(start, end, top, box(0, 0, np.linalg.norm(end - start), floor - top), house, room)
+
+
+def _stand(start: np.ndarray, end: np.ndarray, top: float, shape: shapely.Geometry, house: int, room: int) -> Panel:
+    """An upright panel between two places of the plan; the room is on the left of the way between them."""
+    right, forward = (start - end) / np.linalg.norm(end - start)
+    axes = np.array(((right, 0, forward), (0, 1, 0)))
+    return Panel(np.array((end[0], top, end[1])), *axes, shape, house, room)
 
 
 def _raise_walls(
@@ -161,8 +188,7 @@ def _raise_walls(
                 wall = wall.difference(box(left, height - top, right, floor - top + 1))
                 cover = cover.difference(ground) if height == top else cover
         if wall.area > thickness * (floor - top):
-            corner, axes = np.array((end[0], top, end[1])), np.array(((-step[0], 0, -step[1]), (0, 1, 0)))
-            yield Panel(corner, *axes, wall, house, room)
+            yield _stand(start, end, top, wall, house, room)
             if cover.area > 0:
                 yield dataclasses.replace(_lay_floor(cover.buffer(0), top, house, room), facing=normal)
 
@@ -180,12 +206,12 @@ def make_house(
         photographs: of each view; without them the images of the Gaussians.
     """
     if not rooms.houses:
-        return DollHouse((), b"")
+        return DollHouse((), (), b"")
     painter = _Painter(scene, rooms, photographs)
     panels = build_panels(rooms, painter.is_open)
     density, places = _pack(panels, _FINEST / float(np.median(rooms.floors)))
     atlas = np.zeros((_ATLAS, _ATLAS, 3), np.uint8)
-    corners: list[list[np.ndarray]] = [[] for _ in rooms.houses]
+    shown = {host: list[np.ndarray]() for host in sorted(set(rooms.hosts))}
     turn, textures = rooms.level[:, (0, 2)].T @ level[:, (0, 2)], []
     for panel, place in zip(panels, places, strict=True):
         flat = _triangulate(panel.shape)
@@ -193,18 +219,62 @@ def make_house(
             textures.append((panel, place, *painter.paint(panel, density)))
             uv = (place + _MARGIN + density * flat) / _ATLAS
         else:
-            uv = np.broadcast_to(2 + panel.facing @ turn, flat.shape)
-        corners[panel.house].append(np.concatenate((panel.locate(flat) @ rooms.level.T, uv), axis=1))
+            along = rooms.show(panel.house, np.array(((0.0, 0.0, 0.0), np.insert(panel.facing, 1, 0.0))))
+            uv = np.broadcast_to(2 + (along[1] - along[0])[[0, 2]] @ turn, flat.shape)
+        world = rooms.show(panel.house, panel.locate(flat)) @ rooms.level.T
+        shown[rooms.hosts[panel.house]].append(np.concatenate((world, uv), axis=1))
     for panel, place, color, seen in textures:
         beside = [other for other in textures if other[0].room == panel.room and other[0].down[1] == panel.down[1]]
+        number = next(number for number, other in enumerate(beside) if other[0] is panel)
         known = max(sum(float(other[3].sum()) for other in beside), 1.0)
         mean = sum(other[2].sum(axis=(0, 1)) for other in beside) / known
+        if panel.down[1] == 1 and not seen.any():
+            color, seen = _continue_walls(beside, number, color.shape[:2]) or (color, seen)
         texture = (255 * _fill(color, seen, mean)).round().clip(0, 255).astype(np.uint8)
         padded, (left, upper) = cv2.copyMakeBorder(texture, *[_MARGIN] * 4, cv2.BORDER_REPLICATE), place
         atlas[upper : upper + padded.shape[0], left : left + padded.shape[1]] = padded
     with io.BytesIO() as file:
         Image.fromarray(atlas).save(file, "WEBP", quality=_QUALITY, method=6)
-        return DollHouse(tuple(np.concatenate(each) for each in corners), file.getvalue())
+        corners = tuple(np.concatenate(each) for each in shown.values())
+        return DollHouse(tuple(_list_nodes(rooms, host) for host in shown), corners, file.getvalue())
+
+
+def _list_nodes(rooms: Rooms, host: int) -> dict[int, tuple[float, Float[np.ndarray, "3"]]]:
+    """See `DollHouse`."""
+    found = {}
+    for house in np.flatnonzero(np.array(rooms.hosts) == host).tolist():
+        for view in rooms.houses[house]:
+            turn = 0.0 if house == host else rooms.plan.drawn[view].turn or 0.0
+            found[view] = turn, rooms.level @ rooms.show(house, rooms.positions[view] @ rooms.level)
+    return dict(sorted(found.items()))
+
+
+def _continue_walls(
+    walls: Sequence[tuple[Panel, Any, np.ndarray, np.ndarray]], number: int, size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]] | None:
+    """A texture of a wall that no camera sees: the colours at the edges of the walls beside it, from one to the other;
+    None if none of them is seen.
+
+    Args:
+        walls: of a room, in order, with their textures.
+        number: of the wall.
+        size: rows and columns of the texture.
+    """
+    order = [*walls[number + 1 :], *walls[:number]]  # the next wall is on the left
+    seen = [(color[: size[0]], known[: size[0]]) for _, _, color, known in order if len(known) >= size[0]]
+    seen = [(color, known) for color, known in seen if known.any(axis=1).all()]
+    if not seen:
+        return None
+    edges = []
+    for (color, known), side in ((seen[0], -1), (seen[-1], 1)):
+        count = max(round(_EDGE * known.shape[1]), 1)
+        while not known[:, ::side][:, :count].any(axis=1).all():
+            count += 1
+        shown = (values[:, ::side][:, :count].sum(axis=1) for values in (color, known))
+        sums = [cv2.GaussianBlur(each.reshape(size[0], -1), (1, 0), 0, sigmaY=_EDGE_SOFT * size[0]) for each in shown]
+        edges.append(sums[0] / np.maximum(sums[1], 1e-9).reshape(-1, 1))
+    share = np.linspace(0, 1, size[1], dtype=np.float32)[None, :, None]
+    return (1 - share) * edges[0][:, None] + share * edges[1][:, None], np.ones(size, np.float32)
 
 
 def _triangulate(shape: shapely.Geometry) -> Float[np.ndarray, "corner 2"]:
@@ -308,8 +378,8 @@ class _Painter:
         is_shown = are_seen(world, self.poses[view], self.reaches[view]).numpy().reshape(distance.shape)
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
         is_below = (np.hypot(offsets[..., 0], offsets[..., 2]) < _TRIPOD * unit) & (offsets[..., 1] > 0.5 * unit)
-        cost = distance * (1 + (_HIDDEN - 1) * (1 - clear)) + np.where(is_below, _AWAY * unit, 0)
-        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in views))
+        cost = distance * (1 + (_HIDDEN - 1) * (1 - clear))
+        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in views)) & ~is_below
         ahead = shapely.Point(self.eyes[view][[0, 2]])
         if outline.contains(ahead) and outline.area < 0.999 * outline.convex_hull.area:
             flat = (places + _ASIDE * unit * normal)[..., (0, 2)][is_seen]

@@ -1,6 +1,6 @@
 """Films: their frames along flights and camera paths, and the one loop that draws and writes them.
 
-The photographs replace the image while the camera stands at a panorama.
+The photographs replace the image while the camera stands at a panorama, and in zooms.
 """
 
 from __future__ import annotations
@@ -28,13 +28,14 @@ from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
-from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Route
+from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
 
 FLIGHT_SECONDS = 4.0  # of the film of a pair
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
 
 Image = Float[np.ndarray, "height width 3"]
-DrawnPose = tuple[Float[np.ndarray, "4 4"], float, Callable[[], Image]]  # a pose, its weight, and what draws it
+Pose = Float[np.ndarray, "4 4"]
+DrawnPose = tuple[Pose, float, Callable[[], Image]]  # a pose, its weight, and what draws it
 
 
 class FilmPhotographs:
@@ -97,23 +98,28 @@ class FilmPhotographs:
             if index in last:
                 weight = last[index] + min(max(weight - last[index], -step), step)
             self._weights[index] = weight
-            if weight > 0:
-                photograph, shown = self._draw(index, pose, plane)
-                shown = weight * shown
-                is_whole = shown.min() > 0.999  # samples are rounded
-                image = photograph if is_whole else draw() * (1 - shown) + photograph * shown
-            else:
-                image = draw()
-            mixed += share * image
+            mixed += share * self.cover(index, weight, pose, plane, draw)
         return mixed
+
+    def cover(
+        self, index: int | None, weight: float, pose: Pose, plane: ImagePlane, draw: Callable[[], Image]
+    ) -> Image:
+        """The image that `draw` returns, with a weight of a photograph over it, as a camera near it sees it."""
+        if weight <= 0 or index is None or index >= len(self._poses):
+            return draw()
+        photograph, shown = self._draw(index, pose, plane)
+        shown = weight * shown
+        is_whole = shown.min() > 0.999  # samples are rounded
+        return photograph if is_whole else draw() * (1 - shown) + photograph * shown
 
     def _draw(
         self, index: int, pose: Float[np.ndarray, "4 4"], plane: ImagePlane
     ) -> tuple[Image, Float[np.ndarray, "height width 1"]]:
-        """A photograph as a camera at its panorama sees it, and where it is shown (0 to 1)."""
+        """A photograph as a camera near its panorama sees it, and where it is shown (0 to 1)."""
         height = next((height for height in _HEIGHTS if height * plane.pixel_angle >= np.pi), _HEIGHTS[-1])
         rotation = self._poses[index, :3, :3].T @ torch.as_tensor(pose[:3, :3], dtype=torch.float64)
-        uv = uv_from_directions(plane.directions() @ rotation.T)
+        offset = torch.from_numpy(find_offset(self._poses[index].numpy(), pose[:3, 3]))
+        uv = uv_from_directions(plane.directions() @ rotation.T + offset)
         drawn = sample_equirect(self._load(index, height), uv.float()).permute(1, 2, 0).numpy()
         return drawn[..., :3], drawn[..., 3:]
 
@@ -127,12 +133,23 @@ class Shot:
         vertical_fov_degrees: of a perspective image.
         seconds: time of the frame in the fades.
         edge: of a tour that is flown; None is the one that the camera is at.
+        moment: of the route that is followed, if it is one.
+        goal: of a zoom, the frame that fades in.
     """
 
     pose: Float[np.ndarray, "4 4"]
     vertical_fov_degrees: float
     seconds: float
     edge: Edge | None = None
+    moment: Moment | None = None
+    goal: Shot | None = None
+
+    @staticmethod
+    def of_moment(moment: Moment, vertical_fov_degrees: float, seconds: float) -> Shot:
+        """The frame of a route."""
+        goal = None if moment.arrival is None else Shot(moment.arrival, vertical_fov_degrees, seconds)
+        fov = moment.narrowing * vertical_fov_degrees
+        return Shot(moment.pose, fov, seconds, moment.step.edge, moment, goal)
 
 
 def list_flight(
@@ -155,7 +172,7 @@ def list_flight(
     for number in range(count):
         at = number / (count - 1)
         if isinstance(flight, Route):
-            shots.append(Shot(flight.pose(at), vertical_fov_degrees, at * flight.seconds, flight.edge(at)))
+            shots.append(Shot.of_moment(flight.at(at), vertical_fov_degrees, at * flight.seconds))
         else:
             shots.append(Shot(flight(at), vertical_fov_degrees, number / fps))
     return shots
@@ -218,15 +235,17 @@ class Film:
         self._layout: Layout = layout
         self._photographs = photographs or FilmPhotographs((), torch.zeros(0, 4, 4))
         self._fade = CrossFade()
+        self._has_zoomed = False
 
     def draw(self, shot: Shot) -> Image:
         """Colour of a frame."""
         scene, part = self._choose(shot)
-        fade = self._fade
+        moment, goal, fade, photographs = shot.moment, shot.goal, self._fade, self._photographs
         fade.compute_weight(shot.seconds)
         slot = fade.choose_slot(scene)
         if slot is not None:
-            fade.show(slot, scene, shot.seconds, part)
+            fade.show(slot, scene, shot.seconds, part, at_once=self._has_zoomed)
+        self._has_zoomed = goal is not None
         fade.move(shot.pose, part)
         weight = fade.compute_weight(shot.seconds)
 
@@ -236,8 +255,29 @@ class Film:
             if isinstance(scene := fade.contents[slot], Scene) and (pose := fade.poses[slot]) is not None
             if share > 0 or slot == fade.front
         ]
-        (plane,) = image_planes(self._layout, self._size, vertical_fov_degrees=shot.vertical_fov_degrees)
-        return self._photographs.mix(drawn, plane, shot.seconds)
+        plane = self._make_plane(shot)
+        if moment is None:
+            return photographs.mix(drawn, plane, shot.seconds)
+        image = photographs.cover(
+            moment.photograph,
+            moment.weight,
+            shot.pose,
+            plane,
+            lambda: np.sum([share * draw() for _, share, draw in drawn], axis=0),
+        )
+        if goal is None:
+            return image
+        arrived = photographs.cover(
+            moment.step.nodes[1],
+            1.0,
+            goal.pose,
+            self._make_plane(goal),
+            lambda: self._draw(1 - fade.front, self._choose(goal)[0], goal),
+        )
+        return (1 - moment.arrived) * image + moment.arrived * arrived
+
+    def _make_plane(self, shot: Shot) -> ImagePlane:
+        return image_planes(self._layout, self._size, vertical_fov_degrees=shot.vertical_fov_degrees)[0]
 
 
 @stage()

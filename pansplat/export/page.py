@@ -12,9 +12,9 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -24,11 +24,9 @@ from urllib.parse import quote
 import msgspec
 import numpy as np
 import scipy
-import shapely
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
-from shapely.geometry import Point, Polygon
 from torch import Tensor
 
 from pansplat import constants, pipeline
@@ -37,6 +35,7 @@ from pansplat.export.doll_house import DollHouse, make_house
 from pansplat.export.film import FilmPhotographs
 from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
+from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
 from pansplat.inputs.pairs import Pair
@@ -51,13 +50,11 @@ from pansplat.system.files import is_written
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
-from pansplat.tours.links import find_link_ring, find_way_along_link, link_parts
-from pansplat.tours.outlook import choose_arrival, find_turned
-from pansplat.tours.plan import Plan, Room
-from pansplat.tours.route import Route, find_angles, plan_route
+from pansplat.tours.links import find_link_ring, link_parts
+from pansplat.tours.outlook import find_widest
+from pansplat.tours.route import find_angles
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
 PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
@@ -65,10 +62,7 @@ MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every dev
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
 _GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
-_FLOWN_SHARE, _STILL_SHARE = (
-    2 / 3,
-    1 / 4,
-)  # of the Gaussians of a panorama, with and without flights, beside photographs
+_SEEN_SHARE = 2 / 3  # of the Gaussians of a panorama, beside photographs that need the bytes
 _GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # of a page: a Gaussian, and a photograph as a fraction of its squared rows
 _PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
@@ -76,11 +70,7 @@ _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
 _TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
 _POSTER_SIZE = (810, 960)  # height and width, pixels
-_UNKNOWN_FLOOR, _ROUGH_OUTLINE = (
-    1.5,
-    0.1,
-)  # metres, around a panorama without a floor; of what is smoothed of a floor's end
-_ROUTE_RATE = 10  # samples of a flight a second
+_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "size": (1.0, 1.0), "places": ()}
 _SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _BATCH = 256  # quads that are drawn together
@@ -162,20 +152,22 @@ def write_page(
     )
     tour = dataclasses.replace(facts.tour, poor=facts.poor)
     rooms = find_rooms(facts) if has_cameras else None
-    plan = None if rooms is None or not rooms.plan.num_heights else rooms.plan
-    floors = _outline_floors(facts, () if plan is None else plan.rooms) if has_cameras else []
     scene = prepared
     flights = _plan_flights(scene, tour, facts)
-    house, has_pictures = DollHouse((), b""), len(photographs) > 0 and photo_height != 0
+    house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, rooms, flights.level, photographs if has_pictures else ())
     heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
-    shares = _share_gaussians(flights, tour.poor, gaussians, heights)
-    kept = round(gaussians * sum(shares[part] for part in flights.parts) / len(flights.parts))
+    flown = _find_flown_parts(flights, tour.poor) if has_pictures else {*flights.parts}
+    views = [view for view, part in enumerate(flights.parts) if part in flown]
+    is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))
+    scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(is_flown))
+    kept = gaussians * len(views) // len(flights.parts)
+    kept = round(kept * _choose_share(kept, heights))
     if len(scene.gaussians) > kept:
         report_progress("merging Gaussians", 0.1)
-        scene = _merge(scene, flights.parts, gaussians, steps=_FIT_STEPS if has_cameras else 0, shares=shares)
+        scene = _merge(scene, flights.parts, kept, steps=_FIT_STEPS if has_cameras else 0)
     report_progress("compressing", 0.6)
     degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
@@ -186,11 +178,11 @@ def write_page(
     if has_pictures:
         left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster + house.atlas)
         with stage(0.95):
-            pictures = pack_photographs(scene, photographs, math.inf if split else left, photo_height)
+            pictures = pack_photographs(prepared, photographs, math.inf if split else left, photo_height)
     report_progress("writing", 0.95)
-    header = _describe_scene(scene, packed, origin, flights, tour, facts)
+    header = _describe_scene(prepared, packed, origin, flights, tour, facts, flown)
     header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
-    header["plan"] = _describe_plan(plan, floors, tour, origin, flights.level)
+    header["plan"] = _describe_plan(facts, flights.level) if has_cameras else _NO_PLAN
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
             {
@@ -200,8 +192,10 @@ def write_page(
             }
             for note in photograph.context[0].notes
         ]
-    for nodes, corners in zip(() if rooms is None else rooms.houses, house.corners, strict=True):
-        header["doll"].append({"nodes": nodes, "corners": (corners - [*origin, 0, 0]).round(5).tolist()})
+    for nodes, corners in zip(house.nodes, house.corners, strict=True):
+        moves = [(turn, *_round(place - origin)) for turn, place in nodes.values()]
+        corners = (corners - [*origin, 0, 0]).round(5).tolist()
+        header["doll"].append({"nodes": [*nodes], "moves": moves, "corners": corners})
     files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title or path.stem)
     inside = sum(len(each["nodes"]) for each in header["doll"])
     return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
@@ -219,9 +213,7 @@ class _Flights:
         groups: views that are blended together.
         edges: two views and the group that is blended between them; without edges all views are blended.
         next: the next panorama on the way from a panorama (row) to another one (column).
-        route: positions, yaws and pitches of the flight through all panoramas, `_ROUTE_RATE` a second; empty without
-            edges.
-        jumps: samples of the route after which the camera jumps to another part.
+        walk: all views, in the order of a visit.
         hysteresis: distance by which another edge must be nearer than the current one.
     """
 
@@ -231,10 +223,9 @@ class _Flights:
     pitch: float
     parts: tuple[int, ...]
     groups: tuple[tuple[int, ...], ...]
+    walk: tuple[int, ...]
     edges: tuple[tuple[int, int, int], ...] = ()
     next: tuple[tuple[int, ...], ...] = ()
-    route: Float[np.ndarray, "time 5"] = field(default_factory=lambda: np.zeros((0, 5)))
-    jumps: tuple[int, ...] = ()
     hysteresis: float = 0.0
 
 
@@ -246,34 +237,33 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
         tour, facts: of the scene before.
     """
     views = tuple(range(len(scene.cam2world)))
+    walk = tuple(dict.fromkeys(tour.plan_walk())) if tour.overlaps else views
+    start, level = scene.cam2world[walk[0]].clone(), facts.level
+    start[:3, :3] = torch.from_numpy(level)
+    yaw, pitch = _find_ahead(tour, facts, walk[0])
+    start = _look(start, level, yaw, pitch)
     if not tour.overlaps:
-        first, level = tour.find_start_view(0), facts.level
-        start = path_poses(scene.cam2world)[0]
-        view = None if first is None else find_angles(level.T @ first)
-        yaw, pitch = choose_arrival(facts.outlooks[0], 0.0, start=view)
-        return _Flights(_look(start, level, yaw, pitch), level, yaw, pitch, (0,) * len(views), (views,))
+        return _Flights(start, level, yaw, pitch, (0,) * len(views), (views,), walk)
     scenes = tour.choose_scene_views()
     groups = tuple(dict.fromkeys(scenes.values()))
-    walk = tour.plan_walk()
-    route = plan_route(tour, [*walk, *tour.find_walk(walk[-1], walk[0])[1:]])  # ends where it begins
-    samples, jumps = _resample(route)
-    start, (yaw, pitch) = torch.from_numpy(route.pose(0.0)), samples[0, 3:].tolist()
-    if tour.find_start_view(walk[0]) is None:
-        _, (yaw, pitch) = find_turned(facts.outlooks[walk[0]])
-    start[:3, :3] = torch.from_numpy(route.level)
     return _Flights(
-        _look(start, route.level, yaw, pitch),
-        route.level,
+        start,
+        level,
         yaw,
         pitch,
         tour.parts,
         groups,
+        walk,
         tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps),
         tuple(tuple(row) for row in tour.find_next_nodes()),
-        samples,
-        jumps,
         EDGE_HYSTERESIS,
     )
+
+
+def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
+    """Yaw and pitch of the start view of a panorama, else of its widest view."""
+    start = tour.find_start_view(view)
+    return (find_widest(facts.outlooks[view]), 0.0) if start is None else find_angles(facts.level.T @ start)
 
 
 def _order_views(scene: Scene, flights: _Flights) -> list[int]:
@@ -287,19 +277,6 @@ def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: floa
     """The pose (4, 4) with the same position that looks in the direction of two angles, relative to `level`."""
     turned = turn_pose(pose, yaw, torch.from_numpy(-level[:, 1]))
     return turn_pose(turned, pitch, -turned[:3, 0])
-
-
-def _resample(route: Route) -> tuple[Float[np.ndarray, "time 5"], tuple[int, ...]]:
-    """Positions, yaws and pitches at `_ROUTE_RATE`, and the samples after which the camera jumps."""
-    columns = np.stack([*route.positions.T, route.yaws, route.pitches])
-    rate = _ROUTE_RATE * route.seconds / (len(route.yaws) - 1)
-    sections = []
-    for section in np.split(columns, route.jumps + 1, axis=1):
-        steps = np.arange(section.shape[1])
-        at = np.linspace(0, steps[-1], max(round(steps[-1] * rate), 1) + 1)
-        sections.append(np.stack([np.interp(at, steps, column) for column in section], axis=1))
-    ends = np.cumsum([len(section) for section in sections])[:-1] - 1
-    return np.concatenate(sections), tuple(ends.tolist())
 
 
 def _prepare(scene: Scene) -> Scene:
@@ -323,41 +300,40 @@ def _prepare(scene: Scene) -> Scene:
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
 
 
-def _share_gaussians(
-    flights: _Flights, poor: Sequence[Edge], gaussians: int, heights: Sequence[int]
-) -> dict[int, float]:
-    """The share of an equal number of Gaussians that the panoramas of each part keep in one file.
-
-    It is all if photographs of their full height fit beside them. Else it is less: they are seen in motion only.
+def _find_flown_parts(flights: _Flights, poor: Sequence[Edge]) -> set[int]:
+    """The parts that have a flight, all without edges: in the others the page shows photographs only.
 
     Args:
         poor: edges along which no camera flies.
-        gaussians: of the page.
+    """
+    flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
+    return flown if flights.edges else {*flights.parts}
+
+
+def _choose_share(count: int, heights: Sequence[int]) -> float:
+    """The share of a number of Gaussians that a page keeps: all, if photographs of their full height fit beside them.
+
+    Args:
         heights: of the photographs in the file.
     """
-    left = _TARGET_BYTES - _PROGRAM_BYTES - _GAUSSIAN_BYTES * gaussians
-    if _PHOTO_BYTES * sum(height**2 for height in heights) <= left or not heights:
-        return dict.fromkeys(flights.parts, 1.0)
-    flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
-    return {part: _FLOWN_SHARE if part in flown or not flights.edges else _STILL_SHARE for part in flights.parts}
+    left = _TARGET_BYTES - _PROGRAM_BYTES - _GAUSSIAN_BYTES * count
+    return 1.0 if _PHOTO_BYTES * sum(height**2 for height in heights) <= left else _SEEN_SHARE
 
 
-def _merge(
-    scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS, shares: Mapping[int, float] | None = None
-) -> Scene:
-    """At most `count` Gaussians, an equal number for each panorama of different parts.
+def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:
+    """At most `count` Gaussians, an equal number for each panorama of different parts that have any.
 
     Args:
         scene: of `_prepare`.
         parts: of each view; they are merged one after the other.
         steps: of the fit of shapes; 0 fits colours only.
-        shares: of the equal number that a part keeps; by default all.
     """
-    merged = []
-    for part in dict.fromkeys(parts):
+    merged, seen = [], {parts[view] for view in scene.gaussians.views.unique().tolist()}
+    total = sum(part in seen for part in parts)
+    for part in dict.fromkeys(part for part in parts if part in seen):
         views = tuple(view for view, other in enumerate(parts) if other == part)
         chosen = select_views(scene, views)
-        kept = max(int(count * len(views) * (1.0 if shares is None else shares[part])) // len(parts), 1)
+        kept = max(count * len(views) // total, 1)
         if len(chosen.gaussians) > kept:
             chosen = _merge_part(chosen, kept, steps)
         labels = torch.tensor(views)[chosen.gaussians.views.long()]
@@ -421,12 +397,17 @@ def _describe_scene(
     flights: _Flights,
     tour: TourGraph,
     facts: TourFacts,
+    flown: set[int],
 ) -> dict[str, Any]:
-    """The numbers of a page, without those of single Gaussians; a part of `PageHeader`."""
+    """The numbers of a page, without those of single Gaussians; a part of `PageHeader`.
+
+    Args:
+        scene: of `_prepare`, with all Gaussians.
+        flown: parts whose Gaussians are in the page.
+    """
     level = flights.level
     positions = scene.cam2world[:, :3, 3].numpy() - origin
     heights = facts.usual_heights
-    starts = [tour.find_start_view(node) for node in range(len(tour))] or [None]
     marks = positions + np.outer(heights, level[:, 1])
     spots = [
         {
@@ -434,12 +415,13 @@ def _describe_scene(
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            **_describe_outlook(facts, view, start),
+            "ahead": _round(np.array(_find_ahead(tour, facts, view))),
+            "hasStart": tour.panoramas[view].start is not None,
+            "hidden": facts.hidden[view],
+            "clearances": facts.clearances[view].round(2).tolist(),
             "radius": round(0.12 * height, 6),
         }
-        for view, (name, position, mark, height, start) in enumerate(
-            zip(scene.names, positions, marks, heights, starts, strict=True)
-        )
+        for view, (name, position, mark, height) in enumerate(zip(scene.names, positions, marks, heights, strict=True))
     ]
     reaches = _measure_reaches(scene, np.array(flights.parts))
     views_of_page = [
@@ -447,7 +429,7 @@ def _describe_scene(
         for position, start, count in zip(positions, packed.starts, packed.counts, strict=True)
     ]
     return {
-        "count": len(scene.gaussians),
+        "count": sum(packed.counts),
         "degree": packed.degree,
         "colorRange": packed.color_range,
         "harmonicsScale": packed.harmonics_scale,
@@ -469,87 +451,34 @@ def _describe_scene(
         "reach": REACH,
         "next": flights.next,
         "poor": tour.poor,
-        "routeRate": _ROUTE_RATE,
-        "route": (flights.route - [*origin, 0.0, 0.0]).round(4).tolist(),
-        "jumps": flights.jumps,
+        "walk": flights.walk,
         "batch": _BATCH,
         "near": constants.NEAR,
         "unit": 1 / scene.frame.unit,
         "tallest": _TALLEST,
         "filterVariance": constants.FILTER_VARIANCE,
         "speed": _SPEED * float(np.median(reaches)),
-        "limits": _limit_parts(reaches, positions, flights, len(tour)),
+        "limits": _limit_parts(reaches, positions, flights, flown),
     }
 
 
-def _describe_outlook(facts: TourFacts, view: int, start: Float[np.ndarray, "3"] | None) -> dict[str, Any]:
-    """The rule of `choose_arrival` at a view, as the bits of the directions from which a camera turns, and yaw and
-    pitch to which it does; and the panoramas whose marks furniture or walls hide.
+def _describe_plan(facts: TourFacts, level: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
+    """The floor plan: its drawing, and where the panoramas are on it.
 
     Args:
-        start: direction of the start view.
+        level: axes that yaws of the page are relative to.
     """
-    angles = None if start is None else find_angles(facts.level.T @ start)
-    is_turned, ahead = find_turned(facts.outlooks[view], angles)
-    turned = sum(1 << number for number in np.flatnonzero(is_turned).tolist())
-    clearances = facts.clearances[view].round(2).tolist()
-    return {"turned": turned, "ahead": _round(np.array(ahead)), "hidden": facts.hidden[view], "clearances": clearances}
-
-
-def _outline_floors(facts: TourFacts, rooms: Sequence[Room]) -> list[Room]:
-    """Rooms around the panoramas that stand in none of the floor plan: where their floor ends, else a circle."""
-    floors: list[Room] = []
-    tour, storeys = facts.tour, assign_storeys(facts.tour)
-    for node, center in enumerate(tour.positions @ tour.level_axes[:, (0, 2)]):
-        point = Point(center)
-        if not any(room.storey == storeys[node] and Polygon(room.outline).contains(point) for room in rooms):
-            found = facts.outlines.get(node)
-            shape = point.buffer(_UNKNOWN_FLOOR) if found is None else Polygon(found.corners)
-            outline = np.array(shape.simplify(_ROUGH_OUTLINE).exterior.coords)[:-1]
-            name = tour.panoramas[node].title or tour.panoramas[node].name
-            floors.append(Room(name, (node,), outline, storeys[node], tour.is_placed(node)))
-    return floors
-
-
-def _describe_plan(
-    plan: Plan | None,
-    floors: Sequence[Room],
-    tour: TourGraph,
-    origin: Float[np.ndarray, "3"],
-    level: Float[np.ndarray, "3 3"],
-) -> dict[str, Any]:
-    """The floor plan: outlines and names of rooms and the doors, to the right and forward of the origin, and the world
-    of each panorama; panoramas of other worlds are elsewhere.
-
-    Args:
-        floors: of `_outline_floors`.
-    """
-    worlds = tour.worlds or (0,)
-    known = [] if plan is None else [*plan.rooms]
-    if not known and not floors:
-        return {"worlds": worlds, "drawn": [], "turns": [0.0] * (max(worlds) + 1), "rooms": [], "doors": []}
-    turn, middle = tour.level_axes[:, (0, 2)].T @ level[:, (0, 2)], origin @ level[:, (0, 2)]
-    turned = [dataclasses.replace(room, outline=room.outline @ turn) for room in (*known, *floors)]
-    turns = Plan(tour, tuple(turned), (), math.nan, None, None, 0, 0).turns
-    rooms = []
-    for number, room in enumerate(turned):
-        circle = shapely.maximum_inscribed_circle(Polygon(room.outline))
-        label = [*_round(np.array(circle.coords[0]) - middle), round(2 * circle.length, 4)]
-        outline = [_round(corner) for corner in room.outline - middle]
-        rooms.append(
-            {
-                "name": room.name,
-                "nodes": room.panoramas,
-                "outline": outline,
-                "label": label,
-                "hasWalls": number < len(known),
-            }
-        )
-    doors = [] if plan is None else plan.doors
-    doors = [{"room": door.rooms[0], "ends": [_round(end) for end in door.ends @ turn - middle]} for door in doors]
-    found = [tour.approximate.get(node) for node in range(len(tour))]
-    drawn = [each and (each.beside, *_round(each.place @ turn - middle), round(each.turn, 5)) for each in found]
-    return {"worlds": worlds, "drawn": drawn, "turns": _round(np.array(turns)), "rooms": rooms, "doors": doors}
+    svg, size, marks = draw_page_plan(facts.plan)
+    right, forward = facts.tour.level_axes[:, (0, 2)].T @ level[:, 2]
+    places = [(x, y, None if turn is None else turn + math.atan2(right, forward)) for x, y, turn in marks]
+    rooms = [room.panoramas for room in facts.plan.rooms]
+    return {
+        "worlds": facts.tour.worlds,
+        "rooms": rooms,
+        "drawing": base64.b64encode(svg).decode(),
+        "size": size,
+        "places": places,
+    }
 
 
 def _describe_links(
@@ -558,8 +487,7 @@ def _describe_links(
     heights: Sequence[float],
     outlooks: Sequence[Float[np.ndarray, "bin"]],
 ) -> list[dict[str, Any]]:
-    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring on the
-    floor; the first ones a place where the fade begins.
+    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring.
 
     Args:
         tour: of the scene.
@@ -569,17 +497,13 @@ def _describe_links(
     """
     links = []
     for (start, end), link in tour.links.items():
-        found: dict[str, Any] = {"from": start, "to": end, "text": link.text}
-        position, is_elsewhere = np.array(spots[start]["position"]), tour.parts[start] != tour.parts[end]
-        way = find_way_along_link(tour, start, end)
-        if way is not None:
-            ring = find_link_ring(tour, start, end, heights[start], outlooks[start])
-            assert ring is not None
-            if is_elsewhere or end in spots[start]["hidden"]:
-                found["mark"] = _round(position + ring)
-            if is_elsewhere:
-                found["leave"] = _round(position + way)
-                found["yaw"] = round(find_angles(tour.level_axes.T @ way / np.linalg.norm(way))[0], 5)
+        direction = tour.find_direction(start, end)
+        assert direction is not None
+        yaw, pitch = find_angles(tour.level_axes.T @ direction)
+        found = {"from": start, "to": end, "text": link.text, "yaw": round(yaw, 5), "pitch": round(pitch, 5)}
+        ring = find_link_ring(tour, start, end, heights[start], outlooks[start])
+        if ring is not None and (tour.parts[start] != tour.parts[end] or end in spots[start]["hidden"]):
+            found["mark"] = _round(np.array(spots[start]["position"]) + ring)
         links.append(found)
     return links
 
@@ -597,21 +521,22 @@ def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.n
 
 
 def _limit_parts(
-    reaches: Float[np.ndarray, "part"], positions: Float[np.ndarray, "view 3"], flights: _Flights, num_panoramas: int
+    reaches: Float[np.ndarray, "part"], positions: Float[np.ndarray, "view 3"], flights: _Flights, flown: set[int]
 ) -> list[float]:
     """How far the camera may move in each part from its edges; without edges, from the nearest panorama."""
     parts = list(flights.parts)
     if not flights.edges:
-        if num_panoramas == 1:
+        if len(positions) == 1:
             return [min(_SINGLE_REACH, 0.5 * float(reaches[0]))]
         distances = scipy.spatial.distance.cdist(positions, positions)
         longest_step = float(scipy.sparse.csgraph.minimum_spanning_tree(distances).toarray().max(initial=0.0))
         return [max(float(reaches[0]), 0.75 * longest_step)]
     most = REACH if len(reaches) > 1 else math.inf
-    return [
+    limits = [
         min(_SINGLE_REACH, 0.5 * reach) if parts.count(part) == 1 else min(reach, most)
         for part, reach in enumerate(reaches.tolist())
     ]
+    return [limit if part in flown else 0.0 for part, limit in enumerate(limits)]
 
 
 def _round(vector: np.ndarray) -> list[float]:

@@ -56,8 +56,8 @@ class PageSpot(_Record):
     """A panorama: its camera, the mark and the radius of its ring on the floor, and where there is something to see.
 
     Attributes:
-        turned: bits of the directions from which a camera that arrives turns (`choose_arrival`).
-        ahead: yaw and pitch to which it turns, radians.
+        ahead: yaw and pitch of its start view, else of the widest one, radians.
+        has_start: whether it has a start view.
         hidden: panoramas whose marks surfaces hide.
         clearances: distances of the nearest surfaces around the camera (`measure_clearance`).
     """
@@ -67,22 +67,21 @@ class PageSpot(_Record):
     mark: Vector
     radius: float
     notes: tuple[PageNote, ...]
-    turned: int
     ahead: tuple[float, float]
+    has_start: bool
     hidden: tuple[int, ...]
     clearances: tuple[tuple[float, ...], ...]
 
 
 class PageLink(_Record):
-    """A link of the tour. One to another part, or to a hidden panorama, has a ring; the first one also a place and a
-    yaw with which the fade begins."""
+    """A link of the tour and its direction, radians. One to another part, or to a hidden panorama, has a ring."""
 
     source: int = msgspec.field(name="from")
     target: int = msgspec.field(name="to")
     text: str
+    yaw: float
+    pitch: float
     mark: Vector | msgspec.UnsetType = msgspec.UNSET
-    leave: Vector | msgspec.UnsetType = msgspec.UNSET
-    yaw: float | msgspec.UnsetType = msgspec.UNSET
 
 
 class PageStart(_Record):
@@ -102,40 +101,32 @@ class PagePhotograph(_Record):
     rotation: tuple[Vector, Vector, Vector]
 
 
-class PageRoom(_Record):
-    """A room of the floor plan, or without walls where the floor of a panorama ends; `label` is the middle and the
-    width of its name. To the right and forward."""
-
-    name: str
-    nodes: tuple[int, ...]
-    outline: tuple[tuple[float, float], ...]
-    label: Vector
-    has_walls: bool
-
-
-class PageDoor(_Record):
-    """A door of a room of the plan."""
-
-    room: int
-    ends: tuple[tuple[float, float], ...]
-
-
 class PagePlan(_Record):
-    """The floor plan: the world of each panorama, the angle that turns each world, and where panoramas at approximate
-    places are drawn (`DrawnPlace`): beside which one, to the right and forward, and their turn."""
+    """The floor plan.
+
+    Attributes:
+        worlds: of each panorama.
+        rooms: the panoramas of each room.
+        drawing: an SVG, base64.
+        size: its width and height, metres.
+        places: of each panorama, to the right and down from the upper left corner, metres; and what yaws there are
+            turned by, radians to the right, None if that is unknown.
+    """
 
     worlds: tuple[int, ...]
-    drawn: tuple[tuple[int, float, float, float] | None, ...]
-    turns: tuple[float, ...]
-    rooms: tuple[PageRoom, ...]
-    doors: tuple[PageDoor, ...]
+    rooms: tuple[tuple[int, ...], ...]
+    drawing: str
+    size: tuple[float, float]
+    places: tuple[tuple[float, float, float | None], ...]
 
 
 class PageHouse(_Record):
     """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas;
-    of tops of walls 2 + the normal of the wall, to the right and forward."""
+    of tops of walls 2 + the normal of the wall, to the right and forward. `moves`: what the
+    surroundings of each panorama are turned by, radians to the right, and where its camera is then."""
 
     nodes: tuple[int, ...]
+    moves: tuple[tuple[float, float, float, float], ...]
     corners: tuple[tuple[float, float, float, float, float], ...]
 
 
@@ -147,11 +138,11 @@ class PageHeader(_Record):
         loading: views in the order of their data.
         level: axes of a level camera (columns right, down, forward).
         parts, groups, edges, hysteresis, reach, next, poor: the graph of the tour (graph.js).
-        route_rate, route, jumps: the flight through all panoramas: position, yaw and pitch at each sample.
+        walk: the panoramas in the order of a visit of all.
         batch, near, filter_variance, tallest: of the picture.
         unit: of a metre in the page.
         speed: of a walk, a second.
-        limits: how far the camera may go in each part.
+        limits: how far the camera may go in each part; 0 where it stands at photographs, and there are no Gaussians.
         folder: address of the folder with the files; None of a page in one file.
     """
 
@@ -172,9 +163,7 @@ class PageHeader(_Record):
     reach: float
     next: tuple[tuple[int, ...], ...]
     poor: tuple[tuple[int, int], ...]
-    route_rate: int
-    route: tuple[tuple[float, float, float, float, float], ...]
-    jumps: tuple[int, ...]
+    walk: tuple[int, ...]
     batch: int
     near: float
     unit: float
@@ -238,10 +227,8 @@ def pack_gaussians(
     means, scales = means[chosen], np.abs(gaussians.scales.float().cpu().numpy()[chosen])
     harmonics = gaussians.harmonics.float().cpu().numpy()[chosen]
     colors = 0.5 + SH_0 * harmonics[:, 0]
-    low = (
-        min(0.0, float(np.quantile(colors, _CLIPPED))) if degree else 0.0
-    )  # without other harmonics black is the least
-    high = max(1.0, float(np.quantile(colors, 1 - _CLIPPED)))
+    lowest, highest = np.quantile(colors, (_CLIPPED, 1 - _CLIPPED)).tolist() if colors.size else (0.0, 1.0)
+    low, high = min(0.0, lowest) if degree else 0.0, max(1.0, highest)  # without other harmonics black is the least
     planes = [
         *(plane for axis in range(3) for plane in _split_floats(means[:, axis], 3)),
         *(plane for axis in range(3) for plane in _split_floats(scales[:, axis], 2)),
@@ -249,7 +236,7 @@ def pack_gaussians(
         _to_bytes(gaussians.opacities.float().cpu().numpy()[chosen], 255.0),
         *(_to_bytes(colors[:, channel] - low, 255.0 / (high - low)) for channel in range(3)),
     ]
-    higher = harmonics[:, 1 : (degree + 1) ** 2].reshape(len(means), -1)
+    higher = harmonics[:, 1 : (degree + 1) ** 2].reshape(len(means), 3 * ((degree + 1) ** 2 - 1))
     scale = max(float(np.quantile(np.abs(higher), 1 - _CLIPPED)) if higher.size else 0.0, 1e-6)
     quantised = np.clip(np.round(higher * (127.0 / scale)), -127, 127).astype(np.int8).view(np.uint8)
     ends = np.searchsorted(ranks[chosen], np.arange(len(order) + 1))
@@ -271,6 +258,8 @@ def _compress(block: bytes) -> bytes:
 
 def _morton_codes(points: Float[np.ndarray, "n 3"]) -> np.ndarray:
     """Positions along a Z-order curve through the box of the middle 98 % of the points."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
     low, high = np.quantile(points, 0.01, axis=0), np.quantile(points, 0.99, axis=0)
     size = np.maximum(high - low, 1e-12)
     cells = np.clip((points - low) / size * (1 << _MORTON_BITS), 0, (1 << _MORTON_BITS) - 1).astype(np.int64)

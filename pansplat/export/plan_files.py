@@ -33,8 +33,12 @@ SUFFIXES = (".svg", ".png")
 _PAPER = 0.02  # metres of paper for a metre: 1:50
 _INCH = 0.0254  # metres
 _DOTS_PER_INCH = 150
-_MARGIN, _GAP, _LINE = 0.8, 1.5, 0.35  # around a storey, between two, and between lines of notes, metres
-_TEXT, _SMALL_TEXT = 0.22, 0.13  # heights, metres
+_MARGIN, _LINE = 0.8, 0.35  # around a storey, and between lines of notes, metres
+_TEXT, _SMALL_TEXT, _LEAST_TEXT = 0.22, 0.13, 0.08  # heights, metres
+_SMALL_SHEET, _SMALL_SHEET_TEXT = (
+    5.5,
+    0.17,
+)  # metres: width whose texts are legible in a quarter of a window; the largest
 _LETTER = 0.72  # width of a letter, of its height
 _MEASURED = 0.6  # metres, the shortest wall whose length is written
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
@@ -75,7 +79,7 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
         )
     facts = TourFacts(scene)
     plan = facts.plan if len(facts.tour) else None
-    if plan is None or not plan.rooms:
+    if plan is None or not plan.num_heights:
         raise InputError(
             f"cannot write {path}: needed a floor, and walls around at least one of "
             f"{describe_count(len(scene.cam2world), 'input camera')}, got none; "
@@ -90,20 +94,30 @@ def write_plan(scene: Scene, path: str | Path) -> Plan:
     return plan
 
 
+def draw_page_plan(plan: Plan) -> tuple[bytes, tuple[float, float], list[tuple[float, float, float | None]]]:
+    """The plan for a corner of a page as SVG, its width and height, and the place of each panorama from the upper left
+    corner, metres, with what its azimuths are turned by."""
+    drawing = _Drawing(plan, is_small=True)
+    places = drawing.panoramas * (1, -1) + (0, drawing.size[1])
+    marks = [(x, y, heading) for (x, y), heading in zip(places.tolist(), drawing.headings, strict=True)]
+    return _draw_figure(drawing, "svg"), drawing.size, marks
+
+
 def describe_plan(plan: Plan) -> list[str]:
     """Lines on the size of a plan and its uncertainty."""
-    area = sum(room.area for room in plan.rooms)
+    closed = [room for room in plan.rooms if room.is_closed]
+    area = sum(room.area for room in closed)
     spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
     count = describe_count(plan.num_heights, "panorama")
     lines = [
-        f"{describe_count(len(plan.rooms), 'room')}, {_format_number(plan, area, 1, power=2)} m² between the walls",
+        f"{describe_count(len(closed), 'room')}, {_format_number(plan, area, 1, power=2)} m² between the walls",
         f"scale: cameras {_format_number(plan, plan.camera_height, 2)} m over the floor (median of {count}{spread})",
     ]
-    inside = {node for room in plan.rooms for node in room.panoramas}
+    inside = {node for room in closed for node in room.panoramas}
     if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
-        lines.append(f"no closed walls around {', '.join(outside)}")
+        lines.append(f"thin: by the extent of the floor, as walls do not close around {', '.join(outside)}")
     if not all(room.is_placed for room in plan.rooms):
-        about = " or are approximate" if plan.tour.approximate else ""
+        about = " or are approximate" if plan.drawn else ""
         lines.append(f"dashed: rooms whose places are not known{about}")
     if plan.wall_error is None:
         return [*lines, "walls: of one panorama each, so that their uncertainty is unknown"]
@@ -126,15 +140,38 @@ def _format_number(plan: Plan, value: float, decimals: int, power: int = 1) -> s
 
 @dataclass(frozen=True, eq=False)
 class _Drawing:
-    """A plan on a sheet: where its rooms, doors, panoramas and texts are, metres to the right and up."""
+    """A plan on a sheet: where its rooms, doors, panoramas and texts are, metres to the right and up.
+
+    Attributes:
+        plan: what is drawn.
+        is_small: for a corner of a page: names only, and larger ones.
+    """
 
     plan: Plan
+    is_small: bool = False
+
+    @cached_property
+    def enlarged(self) -> float:
+        """Factor of texts and dots."""
+        return max(self.size[0] / _SMALL_SHEET, 1.0) if self.is_small else 1.0
+
+    @cached_property
+    def headings(self) -> list[float | None]:
+        """What the azimuths of each panorama are turned by on the sheet, radians to the right; None if unknown."""
+        turns = [self.plan.drawn[node].turn if node in self.plan.drawn else 0.0 for node in range(len(self._pieces))]
+        worlds = [self.plan.turns[world] for world, _ in self._pieces]
+        return [None if own is None else own - turn for own, turn in zip(turns, worlds, strict=True)]
+
+    @cached_property
+    def rooms(self) -> list[Room]:
+        """The rooms with an outline; others are dots."""
+        return [room for room in self.plan.rooms if self.headings[room.panoramas[0]] is not None]
 
     @cached_property
     def _pieces(self) -> list[tuple[int, int]]:
         """World and storey in which each panorama is drawn."""
         pieces = list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
-        drawn = self.plan.tour.approximate
+        drawn = self.plan.drawn
         return [pieces[drawn[node].beside] if node in drawn else piece for node, piece in enumerate(pieces)]
 
     @cached_property
@@ -150,7 +187,7 @@ class _Drawing:
 
     def _turn(self, places: Float[np.ndarray, "*n 2"], node: int) -> Float[np.ndarray, "*n 2"]:
         """Places around a panorama in its turned world."""
-        return self.plan.tour.draw(node, places) @ self._turns[self._pieces[node][0]]
+        return self.plan.draw(node, places) @ self._turns[self._pieces[node][0]]
 
     @cached_property
     def _layout(self) -> tuple[dict[tuple[int, int], Float[np.ndarray, "2"]], tuple[float, float]]:
@@ -162,12 +199,12 @@ class _Drawing:
         order = sorted(set(self._pieces), key=lambda piece: (-worlds.count(piece[0]), piece))
         for piece in order:
             nodes = [node for node, own in enumerate(self._pieces) if own == piece]
-            rooms = [room for room in self.plan.rooms if room.panoramas[0] in nodes]
+            rooms = [room for room in self.rooms if room.panoramas[0] in nodes]
             outlines = [self._turn(room.outline, room.panoramas[0]) for room in rooms]
             places = np.concatenate([self._centers[nodes], *outlines])
             boxes.append((places.min(axis=0) - _MARGIN, np.ptp(places, axis=0) + 2 * _MARGIN))
         lows, sizes = np.array(boxes).transpose(1, 0, 2)
-        corners = np.array(arrange_in_rows(sizes + _GAP))
+        corners = np.array(arrange_in_rows(sizes))
         width, height = (corners + sizes).max(axis=0).tolist()
         moves = np.stack((corners[:, 0], height - (corners + sizes)[:, 1]), axis=1) - lows
         return dict(zip(order, moves, strict=True)), (width, height)
@@ -188,7 +225,8 @@ class _Drawing:
     @cached_property
     def doors(self) -> list[Float[np.ndarray, "2 2"]]:
         """The ends of all doors."""
-        return [self._draw(door.ends, self.plan.rooms[door.rooms[0]]) for door in self.plan.doors]
+        found = [(door.ends, self.plan.rooms[door.rooms[0]]) for door in self.plan.doors]
+        return [self._draw(ends, room) for ends, room in found if room in self.rooms]
 
     @cached_property
     def panoramas(self) -> Float[np.ndarray, "node 2"]:
@@ -198,45 +236,53 @@ class _Drawing:
     @cached_property
     def notes(self) -> list[str]:
         """Lines below the plan."""
-        return describe_plan(self.plan)
+        scale = f"1:{self.plan.frame.unit / _PAPER:g} on paper; the bar is {self.plan.frame.unit:g} m"
+        return [] if self.is_small else [*describe_plan(self.plan), scale]
 
     def list_texts(self) -> list[_Text]:
         """Names and areas of rooms, names of panoramas outside of rooms, and lengths of walls where there is space."""
-        outlines = {room: self.outline(room) for room in self.plan.rooms}
+        outlines = {room: self.outline(room) for room in self.rooms}
         walls = shapely.union_all([Polygon(corners).exterior for corners in outlines.values()])
-        taken, texts = shapely.MultiPoint(self.panoramas).buffer(_SMALL_TEXT), list[_Text]()
+        sizes = (
+            (_SMALL_SHEET_TEXT, _SMALL_TEXT, 0.75 * _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
+        )
+        large, small, least = (self.enlarged * size for size in sizes)
+        taken = shapely.MultiPoint(self.panoramas).buffer(small) | shapely.box(0, 0, *self.size).exterior.buffer(0.01)
+        texts: list[_Text] = []
 
         def add(*options: _Text) -> None:
             nonlocal taken
             texts.append(next((text for text in options if not text.cover.intersects(walls | taken)), options[0]))
             taken |= texts[-1].cover
 
+        inside: set[int] = set()
         for room, corners in outlines.items():
             shape, others = Polygon(corners), np.delete(self.panoramas, room.panoramas, axis=0)
-            free = shape.buffer(-2 * _SMALL_TEXT) - walls.buffer(_SMALL_TEXT) - taken
-            free -= shapely.MultiPoint(others).buffer(6 * _SMALL_TEXT)
+            free = shape.buffer(-2 * small) - walls.buffer(small) - taken
+            free -= shapely.MultiPoint(others).buffer(6 * small)
             circle = shapely.maximum_inscribed_circle(shape if free.is_empty else free)
             (x, y), radius = circle.coords[0], circle.length
             area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
-            about = [(-2.1, "about here")] if room.panoramas[0] in self.plan.tour.approximate else []
-            for row, text in [(0.7, room.name), (-0.7, f"{area} m² ± {error}"), *about]:
-                size = min(_TEXT, 0.9 * radius / math.hypot(_LETTER * len(text) / 2, abs(row) + 0.5))
-                add(_Text("ROOMS", (x, y + row * size), text, size))
-        inside = {node for room in self.plan.rooms for node in room.panoramas}
+            lines = [f"{area} m² ± {error}"] * room.is_closed + ["about here"] * (room.panoramas[0] in self.plan.drawn)
+            for row, text in zip((0.7, -0.7, -2.1), [room.name, *lines[: 0 if self.is_small else None]], strict=False):
+                size = min(large, 0.9 * radius / math.hypot(_LETTER * len(text) / 2, abs(row) + 0.5))
+                inside |= set(room.panoramas[size <= least :])  # one of them has the name of a small room
+                if size > least:
+                    add(_Text("ROOMS", (x, y + row * size), text, size))
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
                 name = self.plan.tour.panoramas[node].label
-                away = 1.5 * _SMALL_TEXT + _LETTER * _SMALL_TEXT * len(name) / 2
-                places = (x + away, y), (x - away, y), (x, y + 2 * _SMALL_TEXT), (x, y - 2 * _SMALL_TEXT)
-                options = [_Text("PANORAMAS", place, name, _SMALL_TEXT) for place in places]
+                away = 1.5 * small + _LETTER * small * len(name) / 2
+                places = (x + away, y), (x - away, y), (x, y + 2 * small), (x, y - 2 * small)
+                options = [_Text("PANORAMAS", place, name, small) for place in places]
                 add(*sorted(options, key=lambda text: LineString(((x, y), text.place)).intersects(walls)))
-        for room, corners in outlines.items():
+        for room, corners in [each for each in outlines.items() if each[0].is_closed and not self.is_small]:
             above = [Polygon(c) for r, c in outlines.items() if r is not room and r.is_placed >= room.is_placed]
             for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
                 length = float(np.linalg.norm(end - start))
-                x, y = (start + end) / 2 + 1.2 * _SMALL_TEXT * np.array((start - end)[::-1]) * (1, -1) / length
+                x, y = (start + end) / 2 + 1.2 * small * np.array((start - end)[::-1]) * (1, -1) / length
                 angle = math.degrees(math.remainder(math.atan2(*(end - start)[::-1]) - _UPWARDS, math.pi) + _UPWARDS)
-                text = _Text("LENGTHS", (x, y), _format_number(self.plan, length, 2), _SMALL_TEXT, angle=angle)
+                text = _Text("LENGTHS", (x, y), _format_number(self.plan, length, 2), small, angle=angle)
                 if length >= _MEASURED and not text.cover.intersects(walls | taken | shapely.union_all(above)):
                     add(text)
         return texts
@@ -252,11 +298,10 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    unit = drawing.plan.frame.unit
-    notes = [*drawing.notes, f"1:{unit / _PAPER:g} on paper; the bar is {unit:g} m"]
+    notes = drawing.notes
     width, height = drawing.size
-    width = max(width, 0.15 * _LETTER * max(map(len, notes)) + _MARGIN)
-    below = _LINE * len(notes) + _MARGIN
+    width = max(width, 0.15 * _LETTER * max(map(len, notes), default=0) + _MARGIN)
+    below = _LINE * len(notes) + _MARGIN if notes else 0.0
     figure = Figure(figsize=(width * _PAPER / _INCH, (height + below) * _PAPER / _INCH))
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(-below, height))
     axes.set_axis_off()
@@ -264,16 +309,16 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
     def points(metres: float) -> float:
         return metres * _PAPER / _POINT
 
-    for room in drawing.plan.rooms:
+    for room in drawing.rooms:
         dashes = "solid" if room.is_placed else "dashed"
-        style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes, "linewidth": points(0.07)}
+        style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes}
+        style["linewidth"] = points(0.07 if room.is_closed else 0.03)
         above = 2 * room.is_placed - 4  # what is sure is on top
         axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", zorder=above, **style)
-    for ends, door in zip(drawing.doors, drawing.plan.doors, strict=True):
-        above = 2 * drawing.plan.rooms[door.rooms[0]].is_placed - 3
-        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt", zorder=above)
-        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt", zorder=above)
-    axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12), markeredgewidth=0)
+    for ends in drawing.doors:
+        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt", zorder=0)
+        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt", zorder=0)
+    axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12 * drawing.enlarged), markeredgewidth=0)
     for text in [*drawing.list_texts(), *_place_notes(notes)]:
         axes.text(
             *text.place,
@@ -286,7 +331,7 @@ def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
             color={"LENGTHS": "#777", "PANORAMAS": "#2b7bb9"}.get(text.layer, "#222"),
             parse_math=False,
         )
-    bar = -_LINE * len(notes) - 0.4
+    bar = -_LINE * len(notes) - 0.4  # on a small sheet it is below it
     axes.plot((_MARGIN / 2, _MARGIN / 2 + 1), (bar, bar), color="#222", linewidth=points(0.05))
     file = io.BytesIO()
     stated = {"Creator": SOFTWARE, "Date": None} if kind == "svg" else {"Software": SOFTWARE}

@@ -21,7 +21,7 @@ _Layer = tuple[str, str, tuple[str, ...]]  # official name, our name, tensors
 _BARE = ("weight",)
 _FULL = ("weight", "bias")
 _BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
-_PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
+_PREFIX = "encoder."  # prefix of the network's tensors in a Lightning checkpoint
 _AUXILIARY_PREFIX = "losses.2.gaussian_head."
 _GRID_HEIGHTS = {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
 """Heights of the panoramas of the stored lookup grids, which are recomputed here."""

@@ -38,7 +38,7 @@ COMPATS: dict[str, Compat] = {"official": "official", "fixed": "fixed"}
 ModelName = Literal["pansplat", "depth", "depth_sharpening"]
 
 _T = TypeVar("_T")
-_MAX_NAMES = 4  # in an error message
+_MAX_NAMES = 4  # names that an error message lists
 
 
 class UnsafeCheckpointError(InputError):
@@ -94,7 +94,7 @@ def load_weights(path: str | Path) -> WeightsFile:
             metadata = file.metadata() or {}
             # Copies: the tensors are maps of the file, which Windows could not replace and a writer would change.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118  # not a dict
-    except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # types that torch lacks
+    except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # torch lacks some types
         raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_suggest_remedy(path)}") from error
     if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
         raise InputError(

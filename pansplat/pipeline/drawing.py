@@ -24,7 +24,7 @@ from pansplat.tours.graph import make_graph
 
 Drawing = Literal["exact", "original"]
 
-_PIXEL_SECONDS = 2e-7  # of an image of a scene of a pair, on two cores (docs/bench_raster.md)
+_PIXEL_SECONDS = 2e-7  # time of a pixel of an image of a pair's scene, on two cores (docs/bench_raster.md)
 
 
 def render(

@@ -27,7 +27,7 @@ from pansplat.tours.graph import MAX_SCENE_VIEWS, TourGraph, find_tours, merge_s
 from pansplat.tours.overlap import connect
 
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
-_GAUSSIANS_PER_SQUARE = 0.75  # of a panorama, over the square of its height; about those of the default model
+_GAUSSIANS_PER_SQUARE = 0.75  # Gaussians of a panorama over the square of its rows; about those of the default model
 _MAX_MERGED = 4  # Gaussians that become one on average
 
 
@@ -60,7 +60,7 @@ def predict_tour(
     warn_of_single_views(tour, predictor)
     max_views, is_refined = find_max_views(predictor), options.joint and options.refine_steps != 0
     total = len(tour.choose_sources(max_views))
-    part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # of a panorama
+    part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # limit of Gaussians of a panorama
     counter = itertools.count(1)
     each = replace(options, joint=False, refine_steps=0) if options.joint else options
 

@@ -2,5 +2,5 @@
 
 An edge joins two panoramas that show the same surfaces. A camera flies along edges; the scene of an edge is predicted
 from its two panoramas and a third one that overlaps with both. Panoramas without poses are parts of their own, with a
-self-edge and the scene of a single view. Between parts the image fades.
+self-edge and the scene of a single view. Between parts the camera zooms, from photograph to photograph.
 """

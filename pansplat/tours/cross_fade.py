@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.route import FADE_SECONDS
+from pansplat.tours.route import FADE_SECONDS, ease
 
 
 class CrossFade:
@@ -38,9 +38,9 @@ class CrossFade:
             return None
         return self.front if shown is None else 1 - self.front
 
-    def show(self, slot: int, content: Scene | int, now: float, part: int = 0) -> None:
-        """Show what is ready in a slot; at time `now` (seconds) the other one starts to fade out."""
-        self._fading = self.contents[slot] is not None or slot != self.front
+    def show(self, slot: int, content: Scene | int, now: float, part: int = 0, *, at_once: bool = False) -> None:
+        """Show what is ready in a slot; at time `now` (seconds) the other one starts to fade out, if not `at_once`."""
+        self._fading = not at_once and (self.contents[slot] is not None or slot != self.front)
         self.contents[slot], self.front, self._start = content, slot, now
         self.poses[slot], self.parts[slot] = None, part
 
@@ -52,9 +52,9 @@ class CrossFade:
 
     def compute_weight(self, now: float) -> float:
         """Weight of what is shown, 0 to 1; that of the other slot is the rest."""
-        done = min(max((now - self._start) / FADE_SECONDS, 0.0), 1.0)
+        done = (now - self._start) / FADE_SECONDS
         self._fading = self._fading and done < 1
-        return done * done * (3 - 2 * done) if self._fading else 1.0
+        return ease(done) if self._fading else 1.0
 
     def clear(self) -> None:
         """Forget both; the first slot is the front."""

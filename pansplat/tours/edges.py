@@ -1,8 +1,8 @@
-"""Edges along which no camera flies: through walls, and where the surfaces of two panoramas disagree; there it fades.
+"""Edges along which no camera flies: through walls, and where the pictures of two panoramas disagree; there it zooms.
 
-Half-way between the panoramas, places of their surfaces are drawn as points. Two numbers predict LPIPS-squeeze of the
-picture there: the share of the sphere where the surfaces disagree, and how near the nearest ones are.
-docs/web.md has the calibration on flights through generated homes.
+A flight looks ahead. At three places of the way, both panoramas' surfaces are drawn as points around the direction of
+the flight. Its pictures are poor where a large share shows a thing twice: at other depths and in other colours.
+docs/web.md has the calibration, an edge a row, on real and generated homes.
 """
 
 from __future__ import annotations
@@ -14,16 +14,20 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.surfaces import locate_ends
+from pansplat.geometry.equirect import pixel_directions, row_weights
+from pansplat.tours.surfaces import OPAQUE, find_colors, locate_ends
 
-POOR = 0.27  # predicted LPIPS-squeeze half-way, above which an edge fades
-_ROWS = 64  # of the depth half-way
-_DISAGREE = 0.1  # of the logarithms of depths
-_NEAR = 0.05  # quantile of the depth around the horizon
+POOR = 0.16  # largest share of a good flight's pictures that shows things twice; by the eye (docs/web.md)
+_ROWS = 64  # of the panoramas of points
+_PLACES = (0.25, 0.5, 0.75)  # of the way
+_AHEAD = math.cos(math.radians(40))  # of the angle from the way, that the pictures of a flight show
+_OTHER_DEPTH, _OTHER_COLOR = 0.1, 0.1  # differences of the logarithms of depths, and of colours in [0, 1]
+_SURFACE = 1.05  # largest ratio of the depths of the points of one pixel that are of its nearest surface
 _COSINE = math.cos(math.radians(3))  # of the Gaussians around the direction of the other camera
 _SHARE = 0.98  # of them on a wall; others are seen beyond a door, or stray
 _DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wall
-_CONSTANT, _DISAGREEMENT, _NEARNESS = 0.256, 0.345, -0.198  # fitted to flights of generated homes
+
+_Points = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]  # places and colours
 
 
 def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -53,7 +57,7 @@ def find_poor_edges(
 def judge_edges(
     scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]
 ) -> dict[tuple[int, int], float]:
-    """LPIPS-squeeze that is expected half-way along each edge between two of a scene's panoramas.
+    """The share of the pictures of a flight that shows things twice, of each edge in its worse direction.
 
     Args:
         scene: of some panoramas, with all Gaussians of each.
@@ -61,41 +65,51 @@ def judge_edges(
         edges: pairs of panoramas; those with another panorama are left out.
     """
     inside, surfaces, centers = locate_ends(scene, panoramas, edges)
-    errors = {}
-    for a, b in inside:
-        disagreement, nearest = measure_way(surfaces[a], surfaces[b], centers[b] - centers[a])
-        errors[a, b] = _CONSTANT + _DISAGREEMENT * disagreement + _NEARNESS * nearest
-    return errors
+    colors = {node: find_colors(scene, panoramas.index(node), min_opacity=OPAQUE) for node in surfaces}
+    return {
+        (a, b): measure_doubled((surfaces[a], colors[a]), (surfaces[b], colors[b]), centers[b] - centers[a])
+        for a, b in inside
+    }
 
 
-def measure_way(
-    first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "m 3"], way: Float[np.ndarray, "3"]
-) -> tuple[float, float]:
-    """The share of directions half-way in which two panoramas show different depths, and the depth of the nearest
-    surfaces as a fraction of the way, at most 1.
+def measure_doubled(first: _Points, second: _Points, way: Float[np.ndarray, "3"]) -> float:
+    """The share of what two panoramas show twice on a way between them, ahead or back, whichever is more.
+
+    It is 1 where they show nothing in common.
 
     Args:
-        first, second: surfaces relative to their cameras.
+        first, second: places of surfaces relative to their cameras, and their colours in [0, 1].
         way: from the first camera to the second one.
     """
-    depths = np.stack([_draw(first - 0.5 * way), _draw(second + 0.5 * way)])
-    weights = np.sin((np.arange(_ROWS) + 0.5) * np.pi / _ROWS)[:, None] * np.isfinite(depths).all(axis=0)
-    with np.errstate(invalid="ignore"):
-        differs = np.abs(np.log(depths[0]) - np.log(depths[1])) > _DISAGREE
-    middle = depths.min(axis=0)[_ROWS // 4 : -_ROWS // 4]
-    known = middle[np.isfinite(middle)]
-    if not len(known) or not weights.any():
-        return 1.0, 0.0
-    nearest = float(np.quantile(known, _NEAR) / np.linalg.norm(way))
-    return float((differs * weights).sum() / weights.sum()), min(nearest, 1.0)
+    rays, area = pixel_directions(_ROWS, 2 * _ROWS).numpy(), row_weights(_ROWS).numpy()[:, None]
+    cosines = rays @ (way / np.linalg.norm(way))
+    shares = np.ones((2, len(_PLACES)))
+    for number, place in enumerate(_PLACES):
+        (depth, color), (other_depth, other_color) = _draw(first, place * way), _draw(second, (place - 1) * way)
+        is_seen = np.isfinite(depth) & np.isfinite(other_depth)
+        ratio = np.divide(depth, other_depth, out=np.ones_like(depth), where=is_seen)
+        is_double = np.abs(np.log(ratio)) > _OTHER_DEPTH
+        is_double &= np.abs(color - other_color).mean(axis=-1) > _OTHER_COLOR
+        for side, cosine in enumerate((cosines, -cosines)):
+            weights = area * (is_seen & (cosine > _AHEAD))
+            if weights.any():
+                shares[side, number] = (is_double * weights).sum() / weights.sum()
+    return float(shares.mean(axis=1).max())
 
 
-def _draw(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "height width"]:
-    """Radial depth around the origin, of the nearest place in each pixel; infinite without one."""
+def _draw(
+    points: _Points, camera: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
+    """Radial depth around a camera of the nearest point in each pixel, infinite without one, and its colour."""
+    places, colors = points[0] - camera, points[1]
     distances = np.maximum(np.linalg.norm(places, axis=1), 1e-9)
     rows = np.arccos(np.clip(-places[:, 1] / distances, -1, 1)) / np.pi * _ROWS
     columns = (np.arctan2(places[:, 0], places[:, 2]) / (2 * np.pi) + 0.5) * 2 * _ROWS
     pixels = np.minimum(rows.astype(int), _ROWS - 1) * 2 * _ROWS + columns.astype(int) % (2 * _ROWS)
     depth = np.full(2 * _ROWS * _ROWS, np.inf)
     np.minimum.at(depth, pixels, distances)
-    return depth.reshape(_ROWS, 2 * _ROWS)
+    shown = distances < _SURFACE * depth[pixels]
+    pixels, colors = pixels[shown], colors[shown]
+    sums = [np.bincount(pixels, channel, len(depth)) for channel in (*colors.T, np.ones(len(pixels)))]
+    color = np.stack(sums[:3], axis=-1) / np.maximum(sums[3], 1)[:, None]
+    return depth.reshape(_ROWS, -1), color.reshape(_ROWS, -1, 3)

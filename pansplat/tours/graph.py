@@ -50,20 +50,24 @@ class DrawnPlace(NamedTuple):
 
     Attributes:
         beside: the panorama whose world it is shown in.
-        place: of its camera, to the right and forward of the tour's level axes, metres.
-        turn: of what is around it, radians to the right.
+        turn: of what is around it, radians to the right; None if it is unknown.
+        shift: after the turn, to the right and forward of the tour's level axes, metres.
     """
 
     beside: int
-    place: Float[np.ndarray, "2"]
-    turn: float
+    turn: float | None
+    shift: Float[np.ndarray, "2"]
+
+    def move(self, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where places around the panorama are shown, to the right and forward."""
+        return places @ turn_plan(self.turn or 0.0) + self.shift
 
 
 @dataclass(frozen=True, eq=False)
 class TourGraph:
     """Panoramas of one place and the edges between them.
 
-    Panoramas that edges connect are a part. Within a part the camera flies; from part to part the image fades. Parts
+    Panoramas that edges connect are a part. Within a part the camera flies; from part to part it zooms. Parts
     without a common world are side by side (`lay_out`).
 
     Attributes:
@@ -139,7 +143,7 @@ class TourGraph:
 
     @cached_property
     def approximate(self) -> dict[int, DrawnPlace]:
-        """The nodes that are not placed and have an approximate place."""
+        """Where the nodes that are not placed probably are, as the files of the tour state it."""
         number, found = {panorama.image: node for node, panorama in enumerate(self.panoramas)}, {}
         for node, panorama in enumerate(self.panoramas):
             about = panorama.placement.about
@@ -149,21 +153,15 @@ class TourGraph:
                     math.atan2(*(self.level_axes.T @ self.cam2world[n, :3, 2].numpy())[::2]) for n in (beside, node)
                 )
                 offset = np.array((about.right, about.forward)) * self._find_scale(about, beside)
-                place = self.positions[beside] @ self.level_axes[:, (0, 2)] + offset @ _turn_plan(yaw)
-                found[node] = DrawnPlace(beside, place, wrap_angle(yaw + about.yaw - own))
+                centers, turn = self.positions @ self.level_axes[:, (0, 2)], wrap_angle(yaw + about.yaw - own)
+                shift = centers[beside] + offset @ turn_plan(yaw) - centers[node] @ turn_plan(turn)
+                found[node] = DrawnPlace(beside, turn, shift)
         return found
 
     def _find_scale(self, about: ApproximatePlace, beside: int) -> float:
         """Metres of the tour's world that are 1 in a place beside a panorama."""
         view = self.panoramas[beside]
         return view.camera_height if about.is_in_heights else 1 / view.frame.unit
-
-    def draw(self, node: int, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Where a plan shows places around a node, to the right and forward of the level axes."""
-        drawn = self.approximate.get(node)
-        if drawn is None:
-            return places
-        return drawn.place + (places - self.positions[node] @ self.level_axes[:, (0, 2)]) @ _turn_plan(drawn.turn)
 
     def with_walls(self, walls: Iterable[Edge]) -> TourGraph:
         """The graph with further walls in place of edges; a node without another edge gets a self-edge."""
@@ -515,7 +513,7 @@ class TourGraph:
         return ways, previous
 
 
-def _turn_plan(yaw: float) -> Float[np.ndarray, "2 2"]:
+def turn_plan(yaw: float) -> Float[np.ndarray, "2 2"]:
     """The rotation to the right of rows (right, forward), which is applied from the right."""
     return np.array(((math.cos(yaw), -math.sin(yaw)), (math.sin(yaw), math.cos(yaw))))
 

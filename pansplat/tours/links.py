@@ -1,4 +1,4 @@
-"""Where the links of a tour are in space, the way along a link and its ring on the floor, and links through walls."""
+"""Where the rings of links are in space, and links through walls."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from pansplat.inputs.pairs import Link
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.outlook import find_bin
 
-_WAY_METRES = 0.7  # that the camera goes along a link, before the fade
-_RING_METRES = (1.0, 3.0)  # distance of a link's ring
-_BEFORE_WALL = 0.8  # of the distance of a wall
-_NEAREST_WALL = 1.3  # metres of a ring before a wall, at least: a camera that looks down by 20 degrees shows it
+_NEAREST_METRES = 1.0  # of a link's ring
+_WALL_METRES = 3.0  # usual distance of a wall
 _MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical
 
 
@@ -33,18 +31,12 @@ def link_parts(tour: TourGraph) -> TourGraph:
     return dataclasses.replace(tour, panoramas=tuple(panoramas)) if tour.walls else tour
 
 
-def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
-    """The level way of 0.7 m, in world axes, along the link between nodes; None without one, or if it is vertical."""
-    direction = _find_level_direction(tour, start, end)
-    return None if direction is None else _WAY_METRES * direction
-
-
 def find_link_ring(
     tour: TourGraph, start: int, end: int, height: float, outlook: Float[np.ndarray, "bin"] | None = None
 ) -> Float[np.ndarray, "3"] | None:
     """From a camera to the ring of a link, in world axes; None without a link, or if it is vertical.
 
-    It is where the link meets the floor, 1 to 3 m away. A wall brings it nearer, to 1.3 m at the least.
+    It is where the link meets the floor, 1 m away at the least, or the wall before that.
 
     Args:
         tour: the graph.
@@ -56,12 +48,12 @@ def find_link_ring(
     if along is None or direction is None:
         return None
     down = tour.level_axes[:, 1]
-    fall = float(direction @ down)
-    distance = height * float(direction @ along) / fall if fall > 0 else _RING_METRES[1]
+    slope = float(direction @ down) / float(direction @ along)
     right, _, forward = tour.level_axes.T @ along
-    wall = 0.0 if outlook is None else float(outlook[find_bin(math.atan2(right, forward))])
-    free = max(_BEFORE_WALL * wall, _NEAREST_WALL) if wall else math.inf
-    return float(np.clip(min(distance, free), *_RING_METRES)) * along + height * down
+    wall = _WALL_METRES if outlook is None else float(outlook[find_bin(math.atan2(right, forward))]) or _WALL_METRES
+    if slope * wall < height:
+        return wall * (along + slope * down)
+    return max(height / slope, _NEAREST_METRES) * along + height * down
 
 
 def _find_level_direction(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:

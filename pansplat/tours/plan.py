@@ -14,6 +14,7 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -23,11 +24,19 @@ from shapely.geometry import MultiPolygon, Polygon
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
-from pansplat.tours.floor import assign_storeys, find_ceiling, trace_floor
-from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import sample_surfaces, split_by_azimuth
+from pansplat.tours.floor import assign_storeys, choose_camera_height, find_ceiling, find_floor_outline, trace_floor
+from pansplat.tours.graph import DrawnPlace, TourGraph
+from pansplat.tours.linked_rooms import place_rooms
+from pansplat.tours.surfaces import (
+    RAYS,
+    Outline,
+    meet_outline,
+    ray_angles,
+    ray_directions,
+    sample_surfaces,
+    split_by_azimuth,
+)
 
-_RAYS = 360
 _SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
 _WALL_BAND = 0.6, 0.85  # of a wall above doors and below beams, fractions of the ceiling's height over the camera
 _LEAST_CEILING = 0.25  # height over the camera, below which doors may reach into the band
@@ -47,11 +56,12 @@ _NARROW, _COLLINEAR = 0.12, 0.02  # half width of spikes that are left out; merg
 _LEAST_AREA = 0.4  # of a room, squared camera heights
 _BEYOND = 0.25  # of the floor behind an opening
 _LOW = 0.5, 0.9  # where an opening that reaches to the floor is seen, fractions of the height below the camera
+_BROAD, _LEAST_HALF = (0.12, 0.88), 0.5  # of the ends of a floor, which goes on behind doors; half a rectangle's side
+_LEAST_PIECE = 0.1  # of a rectangle without other rooms, squared camera heights
+_EYE_BAND = 0.4  # heights of the surfaces around a rectangle, over and under the camera
 _DOOR_WIDTHS = 0.33, 1.7
 _SAME_DOOR = 0.4  # distance of the middles of an opening from two sides
 _NEAR_WALL, _LEAST_SEEN = 0.2, 8  # places that show a wall; number of them by one panorama
-
-Outline = Float[np.ndarray, "corner 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +74,7 @@ class Room:
         outline: corners in plan coordinates, metres to the right and forward of the tour's level axes, anticlockwise.
         storey: 0 is the lowest.
         is_placed: whether its place relative to other rooms is known.
+        is_closed: whether walls enclose its cameras; else it is a rectangle by the extent of its floor.
     """
 
     name: str
@@ -71,6 +82,7 @@ class Room:
     outline: Outline
     storey: int
     is_placed: bool
+    is_closed: bool = True
 
     @property
     def area(self) -> float:
@@ -119,6 +131,16 @@ class Plan:
         """Where the world of the plan is in that of files."""
         return self.tour.panoramas[0].frame
 
+    @cached_property
+    def drawn(self) -> dict[int, DrawnPlace]:
+        """Where panoramas are that links join with others (`place_rooms`)."""
+        outlines = {node: room.outline for room in self.rooms for node in room.panoramas}
+        return place_rooms(self.tour, outlines, self.camera_height) if outlines else {}
+
+    def draw(self, node: int, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where the plan shows places around a panorama, to the right and forward of the level axes."""
+        return self.drawn[node].move(places) if node in self.drawn else places
+
     @property
     def turns(self) -> list[float]:
         """For each world the angle, anticlockwise, by which it is turned so that its longest wall is horizontal."""
@@ -164,7 +186,7 @@ class _Lines:
 
 
 def make_plan(scene: Scene, tour: TourGraph, heights: Sequence[float | None]) -> Plan:
-    """The floor plan of a scene; without rooms if no panorama shows walls around it.
+    """The floor plan of a scene.
 
     Args:
         scene: with input cameras, not fused: each panorama with its own Gaussians.
@@ -172,24 +194,56 @@ def make_plan(scene: Scene, tour: TourGraph, heights: Sequence[float | None]) ->
         heights: of the cameras over the floor (`find_camera_height`).
     """
     known = np.array([height for height in heights if height is not None])
-    if not len(known):
-        return Plan(tour, (), (), math.nan, None, None, 0, 0)
-    level, count, unit = tour.level_axes, len(tour), float(np.median(known))
+    level, count, unit = tour.level_axes, len(tour), choose_camera_height(heights, scene.far)
     sights = [_look(scene, view, level, heights[view] or unit) for view in range(count)]
     storeys, parts = assign_storeys(tour), tour.worlds
     rooms: list[Room] = []
     for part, storey in sorted({*zip(parts, storeys, strict=True)}):
         members = [k for k in range(count) if sights[k] is not None and (parts[k], storeys[k]) == (part, storey)]
         in_part = [sights[k] for k in range(count) if sights[k] is not None and parts[k] == part]
-        if members:
-            normals = _find_directions(in_part, unit)
-            for nodes, outline in _outline_rooms(sights, members, normals, unit):
-                is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
-                rooms.append(Room(_name_room(tour, nodes), nodes, outline, storey, is_placed))
-    disagreement, num_walls = _measure_walls(rooms, sights, parts, unit)
+        normals = _find_directions(in_part, unit) if in_part else np.eye(2)
+        found = [(*room, True) for room in _outline_rooms(sights, members, normals, unit)] if members else []
+        free = {k for k in range(count) if (parts[k], storeys[k]) == (part, storey)}.difference(*(n for n, *_ in found))
+        for view in sorted(free):
+            point = shapely.Point(tour.positions[view] @ level[:, (0, 2)])
+            inside = [n for n, (_, outline, _) in enumerate(found) if Polygon(outline).contains(point)]
+            beside = shapely.union_all([Polygon(outline) for _, outline, _ in found])
+            if inside:
+                nodes, *others = found[inside[0]]
+                found[inside[0]] = ((*nodes, view), *others)
+            elif (outline := _enclose((scene, view, level), normals, beside, unit)) is not None:
+                found.append(((view,), outline, False))
+        for nodes, outline, is_closed in found:
+            is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
+            rooms.append(Room(_name_room(tour, nodes), nodes, outline, storey, is_placed, is_closed))
+    disagreement, num_walls = _measure_walls([room for room in rooms if room.is_closed], sights, parts, unit)
     scale = float(1.4826 * np.median(np.abs(known - unit)) / unit) if len(known) > 2 else None
     doors = _find_doors(rooms, sights, unit)
     return Plan(tour, tuple(rooms), doors, unit, scale, disagreement, len(known), num_walls)
+
+
+def _enclose(
+    view: tuple[Scene, int, Float[np.ndarray, "3 3"]], normals: np.ndarray, beside: shapely.Geometry, unit: float
+) -> Outline | None:
+    """A rectangle along the walls around a camera without closed walls: the extent of its floor, or of the surfaces at
+    its height, without the rooms beside it; None if nothing of it is left.
+
+    Args:
+        view: scene, number and level axes.
+    """
+    scene, number, level = view
+    center, floor = level[:, (0, 2)].T @ scene.cam2world[number, :3, 3].double().numpy(), find_floor_outline(*view)
+    places = sample_surfaces(*view)
+    ends = _measure_reach(places[np.abs(places[:, 1]) < _EYE_BAND * unit][:, (0, 2)])[:, None] * ray_directions()
+    corners = center + ends[np.isfinite(ends[:, 0])] if floor is None else floor.corners
+    axes, least = np.stack((normals[0], (-normals[0, 1], normals[0, 0])), axis=1), _LEAST_HALF * unit
+    low, high = np.quantile(corners @ axes, _BROAD, axis=0) if len(corners) else (center @ axes,) * 2
+    low, high = np.minimum(low, center @ axes - least), np.maximum(high, center @ axes + least)
+    box = Polygon(shapely.get_coordinates(shapely.box(*low, *high)) @ axes.T)
+    free = _clean(box.difference(beside).buffer(0), unit)
+    pieces = [piece for piece in shapely.get_parts(free) if piece.area > _LEAST_PIECE * unit**2]
+    piece = min(pieces, key=lambda piece: piece.distance(shapely.Point(center)), default=None)
+    return None if piece is None else np.array(shapely.orient_polygons(piece).exterior.coords)[:-1]
 
 
 def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
@@ -208,25 +262,15 @@ def _look(scene: Scene, view: int, level: Float[np.ndarray, "3 3"], height: floa
         found = trace_floor(places)
         if found is None:
             return None
-        reach = np.repeat(np.linalg.norm(found[0], axis=1), _RAYS // len(found[0]))
-        walls = reach[:, None] * _rays()
+        reach = np.repeat(np.linalg.norm(found[0], axis=1), RAYS // len(found[0]))
+        walls = reach[:, None] * ray_directions()
         return _Sight(center, walls, center + walls, low[:0])  # no wall is above the openings
     band = flat[(-down > _WALL_BAND[0] * ceiling) & (-down < _WALL_BAND[1] * ceiling)]
     band = band[np.linalg.norm(band, axis=1) > _LEAST_DISTANCE * height]
     reach = _measure_reach(band)
-    if np.isfinite(reach).sum() < _RAYS // 2:
+    if np.isfinite(reach).sum() < RAYS // 2:
         return None
-    return _Sight(center, reach[:, None] * _rays(), center + band, low)
-
-
-def _ray_angles() -> Float[np.ndarray, "ray"]:
-    """Azimuths from forward to the right, radians."""
-    return (np.arange(_RAYS) + 0.5) * 2 * math.pi / _RAYS
-
-
-def _rays() -> Float[np.ndarray, "ray 2"]:
-    angles = _ray_angles()
-    return np.stack((np.sin(angles), np.cos(angles)), axis=1)
+    return _Sight(center, reach[:, None] * ray_directions(), center + band, low)
 
 
 def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]:
@@ -234,10 +278,10 @@ def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]
 
     It is the median of those near the median of all, so that a beam in front or an opening does not move it.
     """
-    distances = split_by_azimuth(places, np.linalg.norm(places, axis=1), _RAYS)
-    reach = np.full(_RAYS, np.nan)
-    for ray in range(_RAYS):
-        found = np.concatenate([distances[(ray + shift) % _RAYS] for shift in range(-_BESIDE, _BESIDE + 1)])
+    distances = split_by_azimuth(places, np.linalg.norm(places, axis=1), RAYS)
+    reach = np.full(RAYS, np.nan)
+    for ray in range(RAYS):
+        found = np.concatenate([distances[(ray + shift) % RAYS] for shift in range(-_BESIDE, _BESIDE + 1)])
         if len(found) > 2:
             level = np.quantile(found, 0.5, method="lower")
             reach[ray] = np.median(found[np.abs(found - level) <= _SURFACE * level])
@@ -331,7 +375,7 @@ def _trace_outline(sight: _Sight, lines: _Lines, unit: float) -> Polygon | None:
     offsets = lines.offsets - lines.normals @ sight.center  # relative to the camera
     for ray in changes.tolist():
         before, after = int(sequence[ray - 1]), int(sequence[ray])
-        border = ray * 2 * math.pi / _RAYS  # between the two rays
+        border = ray * 2 * math.pi / RAYS  # between the two rays
         direction = np.array((math.sin(border), math.cos(border)))
         corners += _join(direction, lines.normals[[before, after]], offsets[[before, after]], unit)
     outline = np.array(corners).reshape(-1, 2)
@@ -367,17 +411,17 @@ def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | Non
             distance = offsets / (rays @ lines.normals.T)
         return np.where(distance > 0, distance, np.inf)
 
-    reached = meet(_rays())
+    reached = meet(ray_directions())
     error = np.abs(reached - measured[:, None]) / unit
     costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _DISTANCE_NOISE
     costs[np.isinf(reached)] = _NEVER
-    angles = np.arange(_RAYS) * 2 * math.pi / _RAYS
+    angles = np.arange(RAYS) * 2 * math.pi / RAYS
     between = meet(np.stack((np.sin(angles), np.cos(angles)), axis=1))
     beyond = np.where(np.isinf(between), _NEVER, 0.0)  # a wall ends where a ray meets it
     between = np.minimum(between, 1e3 * unit)
     total, origins = costs[0], []
-    for step in range(1, 3 * _RAYS):
-        ray = step % _RAYS
+    for step in range(1, 3 * RAYS):
+        ray = step % RAYS
         jump = np.abs(between[ray][:, None] - between[ray]) / (_JUMP * unit)
         change = _CORNER + np.minimum(jump, _LARGEST_JUMP) + beyond[ray] + beyond[ray][:, None]
         np.fill_diagonal(change, 0)
@@ -389,7 +433,7 @@ def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | Non
         sequence.append(state)
         state = int(origin[state])
     sequence.append(state)
-    return np.array(sequence[::-1])[_RAYS : 2 * _RAYS]
+    return np.array(sequence[::-1])[RAYS : 2 * RAYS]
 
 
 def _join(
@@ -530,7 +574,7 @@ def _find_doors(rooms: Sequence[Room], sights: Sequence[_Sight | None], unit: fl
     """The openings through which panoramas show what is beyond the walls of their rooms, down to the floor."""
     found: list[tuple[int, np.ndarray, int]] = []  # room, ends, rays
     for number, room in enumerate(rooms):
-        for node in room.panoramas:
+        for node in [node for node in room.panoramas if room.is_closed and sights[node] is not None]:
             found += [(number, ends, rays) for ends, rays in _find_openings(sights[node], room.outline, unit)]
     found.sort(key=lambda opening: -opening[2])
     doors: list[Door] = []
@@ -552,20 +596,20 @@ def _find_doors(rooms: Sequence[Room], sights: Sequence[_Sight | None], unit: fl
 def _find_openings(sight: _Sight, outline: Outline, unit: float) -> list[tuple[np.ndarray, int]]:
     """Ends on one wall of each opening that a panorama shows, and the number of its rays."""
     reach = _measure_reach(sight.low)
-    distance, wall = _meet_outline(sight.center, outline)
+    distance, wall = meet_outline(sight.center, outline)
     with np.errstate(invalid="ignore"):
         is_open: Bool[np.ndarray, "ray"] = (reach > distance + _BEYOND * unit) & (wall >= 0)
     labels = np.where(is_open, wall, -1)
     start = int(np.argmin(is_open)) if not is_open.all() else 0  # a ray that is not open, so that no run is cut
-    order = np.roll(np.arange(_RAYS), -start)
+    order = np.roll(np.arange(RAYS), -start)
     openings = []
     for label, run in itertools.groupby(order.tolist(), key=lambda ray: labels[ray]):
         rays = list(run)
         if label < 0 or len(rays) < 3:
             continue
-        half = math.pi / _RAYS
+        half = math.pi / RAYS
         corners = outline[label], outline[(label + 1) % len(outline)]
-        angles = _ray_angles()[[rays[0], rays[-1]]] + (-half, half)
+        angles = ray_angles()[[rays[0], rays[-1]]] + (-half, half)
         ends = np.array([_meet_line(sight.center, angle, *corners) for angle in angles])
         width = float(np.linalg.norm(ends[1] - ends[0]))
         if _DOOR_WIDTHS[0] * unit < width < _DOOR_WIDTHS[1] * unit:
@@ -580,17 +624,3 @@ def _meet_line(center: np.ndarray, angle: float, start: np.ndarray, end: np.ndar
     if abs(np.linalg.det(system)) < 1e-12:
         return start
     return start + float(np.clip(np.linalg.solve(system, center - start)[0], 0, 1)) * (end - start)
-
-
-def _meet_outline(center: Float[np.ndarray, "2"], outline: Outline) -> tuple[np.ndarray, np.ndarray]:
-    """Distance at which each ray meets the outline, and the number of that wall; infinite and -1 if it does not."""
-    rays, along = _rays(), np.roll(outline, -1, axis=0) - outline
-    cross = rays[:, None, 0] * along[:, 1] - rays[:, None, 1] * along[:, 0]
-    offset = outline - center
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / cross
-        position = (offset[:, 0] * rays[:, None, 1] - offset[:, 1] * rays[:, None, 0]) / cross
-    distance = np.where((distance > 0) & (position >= 0) & (position <= 1), distance, np.inf)
-    nearest = distance.argmin(axis=1)
-    reached = distance[np.arange(_RAYS), nearest]
-    return reached, np.where(np.isfinite(reached), nearest, -1)

@@ -1,164 +1,279 @@
-"""Smooth flights through the panoramas of a tour."""
+"""Ways of the camera through the panoramas of a tour: turns, flights and zooms, one after the other.
+
+At a panorama the camera turns to where it goes. Along an edge it flies, and looks ahead. Any other step is a zoom: the
+photograph grows towards the next panorama, whose photograph fades in.
+"""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from pansplat.geometry.path import turn_axes
+from pansplat.geometry.path import turn_axes, wrap_angle
 from pansplat.tours.graph import Edge, TourGraph
-from pansplat.tours.links import find_way_along_link
-from pansplat.tours.outlook import choose_arrival
+from pansplat.tours.outlook import find_widest
 
 FADE_SECONDS = 1.0
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
 STOP_SECONDS = 0.2  # of the fade between scene and photograph
-_FLY_SPEED = 1.0  # metres per second
-_TURN_DEGREES = 45.0  # per second
-_LOOK_AHEAD = 1.5  # metres along the way, the point that the camera looks at
-_TURN_BACK_DEGREES = 120.0  # of the way at a panorama, at which the camera turns in place
-_TURN_IN_PLACE_DEGREES = 60.0  # between the heading and the way, at which the camera stands still
-_SMOOTHING_SECONDS = 1.2
-_SAMPLES_PER_SECOND = 60
-_LOOK_AROUND_DEGREES = 90.0  # that the camera turns in a part without a way
+REST_SECONDS = 3.0  # at each panorama of a flight through a tour
+_TURN_SECONDS, _TURN_DEGREES = 0.4, 45.0  # of a turn by this angle or more; smaller ones are shorter
+_ZOOM_SECONDS = 0.7
+_END_SECONDS = 0.1  # at the end of a zoom, so that a route ends in the scene of its last panorama
+_ZOOM = 2 / 3  # of the field of view, at the end of a zoom
+_LOWEST = -0.2  # radians, the pitch towards a link, which may be on the floor
+_FLIGHT_SECONDS = 1.0, 1.6  # the least and the most of a flight
+_SHORT, _METRE_SECONDS = 2.0, 0.1  # metres of a flight of the least time, and seconds for each further metre
+_NEAR = 1.0  # metres to the first panorama, below which the camera keeps its heading
+_COVERED = 0.1  # of a flight, from either end: there is the photograph, which fades over as much
+_SURFACES, _MOST_BESIDE = 2.5, 0.4  # usual distance of surfaces, metres, and the most of it from a photograph's camera
+
+Kind = Literal["turn", "flight", "zoom", "rest"]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A movement of the camera, which starts and stops smoothly.
+
+    Attributes:
+        start, end: right, down and forward in metres, yaw and pitch in radians, relative to the route's `level`. A
+            camera that zooms stands at the start, and is at the end afterwards.
+        edge: whose scene is shown; None is that of the camera's place.
+        nodes: the panoramas at both ends; None elsewhere.
+        following: index in the walk of the next panorama.
+    """
+
+    kind: Kind
+    start: Float[np.ndarray, "5"]
+    end: Float[np.ndarray, "5"]
+    seconds: float
+    edge: Edge | None
+    nodes: tuple[int | None, int | None]
+    following: int
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A time of a route.
+
+    Attributes:
+        step: that goes on.
+        pose: of the camera (cam2world).
+        photograph: the panorama whose photograph is shown; None for none.
+        weight: of the photograph over the Gaussians, 0 to 1.
+        arrival: of a zoom, the pose at its end; else None.
+        zoom: fraction of a zoom that is done.
+    """
+
+    step: Step
+    pose: Float[np.ndarray, "4 4"]
+    photograph: int | None
+    weight: float
+    arrival: Float[np.ndarray, "4 4"] | None = None
+    zoom: float = 0.0
+
+    @property
+    def narrowing(self) -> float:
+        """Field of view of the photograph that a zoom begins with, as a fraction of the camera's."""
+        return 1 - (1 - _ZOOM) * self.zoom
+
+    @property
+    def arrived(self) -> float:
+        """Weight of the photograph that a zoom ends with, 0 to 1: the first one is seen to grow."""
+        return self.zoom**2
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A smooth flight through panoramas, in samples of equal duration.
-
-    Leg i is the step from `walk[i]` to `walk[i + 1]`. That of a fade begins with the jump to the other part, after
-    which the camera stands for a moment while the image fades.
+    """A way through panoramas.
 
     Attributes:
-        positions: camera centres, metres.
-        yaws, pitches: radians, relative to `level`; positive turns right and up.
-        legs: leg of each sample; -1 before the first panorama.
-        walk: the panoramas in the order of the flight.
-        edges: of each leg, whose scene is shown; of a fade, that of the part where it ends.
-        fades: the legs that are fades.
+        steps: one or more.
+        walk: the panoramas in the order of the way.
         level: axes of a level camera (columns right, down, forward).
-        seconds: duration.
     """
 
-    positions: Float[np.ndarray, "sample 3"]
-    yaws: Float[np.ndarray, "sample"]
-    pitches: Float[np.ndarray, "sample"]
-    legs: Int[np.ndarray, "sample"]
+    steps: tuple[Step, ...]
     walk: tuple[int, ...]
-    edges: tuple[Edge, ...]
-    fades: tuple[int, ...]
     level: Float[np.ndarray, "3 3"]
-    seconds: float
 
     @cached_property
-    def jumps(self) -> Int[np.ndarray, "jump"]:
-        """The samples after which the camera jumps to another part."""
-        begins = (self.legs[1:] != self.legs[:-1]) & np.isin(self.legs[1:], self.fades)
-        return np.flatnonzero(begins)
+    def _ends(self) -> Float[np.ndarray, "step"]:
+        return np.cumsum([step.seconds for step in self.steps])
 
-    def leg(self, fraction: float) -> int:
-        """Index of the edge that is flown at a fraction of the duration; -1 before the first panorama."""
-        return int(self.legs[round(min(max(fraction, 0.0), 1.0) * (len(self.legs) - 1))])
+    @property
+    def seconds(self) -> float:
+        """The duration."""
+        return float(self._ends[-1])
+
+    @property
+    def visits(self) -> dict[int, float]:
+        """The fraction of the duration at which the camera comes to rest at a panorama, by panorama."""
+        begins = zip(self.steps, self._ends - [step.seconds for step in self.steps], strict=True)
+        rests = [(step.nodes[1], begin / self.seconds) for step, begin in begins if step.kind == "rest"]
+        return {node: at for node, at in rests if node is not None}
+
+    def _find(self, fraction: float) -> tuple[int, float]:
+        """The step at a fraction of the duration, and the eased fraction of it that is done."""
+        time = min(max(fraction, 0.0), 1.0) * self.seconds
+        number = min(int(np.searchsorted(self._ends, time, side="right")), len(self.steps) - 1)
+        return number, ease(1 + (time - float(self._ends[number])) / self.steps[number].seconds)
+
+    def at(self, fraction: float) -> Moment:
+        """The camera at a fraction of the duration, 0 to 1."""
+        number, part = self._find(fraction)
+        step = self.steps[number]
+        if step.kind == "zoom" and part < 1:
+            return Moment(step, self._pose(step.start), step.nodes[0], 1.0, self._pose(step.end), part)
+        pose = self._pose((1 - part) * step.start + part * step.end)
+        end, away = (0, part) if part < 0.5 else (1, 1 - part)
+        weight = min(max(2 - away / _COVERED, 0.0), 1.0) if step.kind == "flight" else 1.0
+        return Moment(step, pose, step.nodes[end], weight if step.nodes[end] is not None else 0.0)
 
     def pose(self, fraction: float) -> Float[np.ndarray, "4 4"]:
-        """The pose (cam2world) at a fraction of the duration, 0 to 1."""
-        at = min(max(fraction, 0.0), 1.0) * (len(self.yaws) - 1)
-        if math.floor(at) in self.jumps:
-            at = round(at)
-        steps = np.arange(len(self.yaws))
-        yaw, pitch = (np.interp(at, steps, values) for values in (self.yaws, self.pitches))
-        pose = np.eye(4)
-        pose[:3, :3] = turn_axes(self.level, float(yaw), float(pitch))
-        pose[:3, 3] = [np.interp(at, steps, column) for column in self.positions.T]
-        return pose
+        """The pose (cam2world) at a fraction of the duration."""
+        return self.at(fraction).pose
 
-    def edge(self, fraction: float) -> Edge | None:
-        """The edge that is flown at a fraction of the duration; None before the first panorama."""
-        leg = self.leg(fraction)
-        return self.edges[leg] if leg >= 0 else None
+    def _pose(self, camera: Float[np.ndarray, "5"]) -> Float[np.ndarray, "4 4"]:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn_axes(self.level, *camera[3:].tolist()), self.level @ camera[:3]
+        return pose
 
     def edges_after(self, fraction: float) -> list[Edge]:
         """The edges from a fraction of the duration on."""
-        return list(self.edges[max(self.leg(fraction), 0) :])
+        return [step.edge for step in self.steps[self._find(fraction)[0] :] if step.edge is not None]
+
+    def list_remaining(self, fraction: float) -> tuple[int, ...]:
+        """The panoramas after a fraction of the duration."""
+        return self.walk[self.at(fraction).step.following :]
 
 
 def plan_route(
     tour: TourGraph,
     walk: Sequence[int],
     start: Float[np.ndarray, "4 4"] | None = None,
-    outlook: Float[np.ndarray, "bin"] | None = None,
+    *,
+    rest: float = 0.0,
+    outlooks: Mapping[int, Float[np.ndarray, "bin"]] | None = None,
 ) -> Route:
-    """A flight along a walk. The camera looks ahead along its way, and flies slower while it turns.
-
-    Where the way turns back, the camera turns in place. All is smoothed over time, so that corners are rounded.
-
-    Before a fade along a link the camera turns in the direction of the link, and goes 0.7 m. Before another one, at a
-    panorama alone, it turns by 90 degrees; so it does at the end, unless a start pose is given. After a fade, it looks
-    in the direction of the panorama's start view; without one, away from the link back; else its heading stays.
+    """A way along a walk. It ends in the start view of its last panorama, else in the direction of arrival.
 
     Args:
         tour: the graph.
         walk: nodes; consecutive ones share an edge, or are of different parts.
         start: pose from which the first node is approached; None starts at that node, in the direction of its start
             view, or of the second node.
-        outlook: of the last node (`measure_outlook`), at which the flight ends as `choose_arrival` states; None leaves
-            it as it is.
+        rest: seconds at each panorama on the first visit, in its start view.
+        outlooks: of panoramas (`measure_outlook`), in whose widest view a zoom to another world ends if nothing else is
+            stated.
     """
-    steps = list(itertools.pairwise(walk))
-    fades = [leg for leg, step in enumerate(steps) if tour.is_fade(*step)]
-    edges = [(min(step), max(step)) for step in steps]
-    for leg in fades:
-        is_flown = leg + 1 < len(steps) and leg + 1 not in fades
-        edges[leg] = edges[leg + 1] if is_flown else tour.find_edge(walk[leg + 1])
-    level, yaw, pitch = tour.level_axes, None, 0.0
-    if start is not None:
-        yaw, pitch = find_angles(level.T @ start[:3, 2])
-    elif (view := tour.find_start_view(walk[0])) is not None:
-        yaw, pitch = find_angles(level.T @ view)
-    sections = []
-    for first, last in itertools.pairwise([-1, *fades, len(steps)]):
-        nodes = walk[first + 1 : last + 1]
-        places, legs = [tour.positions[node] for node in nodes], list(range(first + 1, last))
-        link = find_way_along_link(tour, *steps[last]) if last < len(steps) else None
-        if link is not None:
-            places.append(places[-1] + link)
-            legs.append(legs[-1] if legs else first)
-        if first < 0 and start is not None:
-            if last == 0 < len(steps):  # a fade begins where the camera is, or near the link
-                places = places[1:]
-            else:
-                legs = [-1, *legs]
-            places = [start[:3, 3], *places]
-        if first >= 0:
-            yaw, pitch = _find_arrival(tour, *steps[first]) or (yaw, 0.0)
-        is_seen = start is None or 0 <= first < last < len(steps)  # of a user's flight, not the ends
-        around = math.radians(_LOOK_AROUND_DEGREES) if is_seen and len(places) == 1 and steps else 0.0
-        arrival = None
-        if outlook is not None and last == len(steps):
-            view = tour.find_start_view(walk[-1])
-            arrival = partial(choose_arrival, outlook, start=None if view is None else find_angles(level.T @ view))
-        sections.append(_fly(np.array(places) @ level, legs, first, yaw, pitch, around, arrival))
-        yaw = float(sections[-1][3][-1])
-    *positions, yaws, pitches, numbers = (np.concatenate(values) for values in zip(*sections, strict=True))
-    return Route(
-        np.stack(positions, axis=1) @ level.T,
-        yaws,
-        pitches,
-        numbers,
-        tuple(walk),
-        tuple(edges),
-        tuple(fades),
-        level,
-        (len(yaws) - 1) / _SAMPLES_PER_SECOND,
-    )
+    planner = _Planner(tour, outlooks or {})
+    planner.begin(walk, start)
+    for number, node in enumerate(walk):
+        planner.go(node, walk[number + 1 : number + 2])
+        is_visit = rest > 0 and node not in walk[:number] and (start is None or len(planner.steps) > 0)
+        has_zoomed = len(planner.steps) > 0 and planner.steps[-1].kind == "zoom"
+        if (is_visit or number == len(walk) - 1) and not has_zoomed:
+            planner.turn(planner.find_start_view(node))
+        if is_visit:
+            planner.add("rest", planner.camera, rest)
+    if not planner.steps or planner.steps[-1].kind == "zoom":
+        planner.add("rest", planner.camera, _END_SECONDS)
+    return Route(tuple(planner.steps), tuple(walk), tour.level_axes)
+
+
+class _Planner:
+    """Adds the steps of a route; `camera`, `node` and `edge` are those at the end of the last one."""
+
+    def __init__(self, tour: TourGraph, outlooks: Mapping[int, Float[np.ndarray, "bin"]]) -> None:
+        self.tour, self.outlooks = tour, outlooks
+        self.level, self.places = tour.level_axes, tour.positions @ tour.level_axes
+        self.steps: list[Step] = []
+        self.node: int | None = None
+        self.edge: Edge | None = None
+        self.following = 0
+
+    def begin(self, walk: Sequence[int], start: Float[np.ndarray, "4 4"] | None) -> None:
+        """Stand at a pose, or at the first panorama."""
+        if start is None:
+            ahead = self.find_way(walk[0], walk[1]) if len(walk) > 1 else None
+            self.camera = np.array((*self.places[walk[0]], *(self.find_start_view(walk[0]) or ahead or (0.0, 0.0))))
+        else:
+            self.camera = np.array((*self.level.T @ start[:3, 3], *find_angles(self.level.T @ start[:3, 2])))
+        distances = np.linalg.norm(self.places - self.camera[:3], axis=1)
+        if distances.min() <= STOP_REACH:
+            self.node = int(distances.argmin())
+
+    def add(self, kind: Kind, camera: Sequence[float] | np.ndarray, seconds: float, node: int | None = None) -> None:
+        """Go to a camera, at a panorama or where the camera is."""
+        end, nodes = np.array(camera, dtype=float), (self.node, self.node if node is None else node)
+        self.steps.append(Step(kind, self.camera, end, seconds, self.edge, nodes, self.following))
+        self.camera, self.node = end, nodes[1]
+
+    def turn(self, view: Sequence[float] | None) -> None:
+        """Turn to a yaw and pitch; a small angle takes less time."""
+        yaw, pitch = self.camera[3:] if view is None else view
+        across = wrap_angle(yaw - self.camera[3])
+        part = min(math.hypot(across, pitch - self.camera[4]) / math.radians(_TURN_DEGREES), 1.0)
+        if part > 1e-6:
+            self.add("turn", (*self.camera[:3], self.camera[3] + across, pitch), part * _TURN_SECONDS)
+
+    def go(self, node: int, after: Sequence[int]) -> None:
+        """Go to a panorama, after which another one may follow."""
+        before = self.node
+        if before is not None and self.tour.is_fade(before, node):
+            self.turn(self.find_way(before, node))
+            self.add("zoom", (*self.places[node], *self.find_arrival(before, node)), _ZOOM_SECONDS, node)
+        elif before != node:
+            edge = None if before is None else (min(before, node), max(before, node))
+            self.edge = edge if edge in self.tour.overlaps else self.edge
+            self.fly(node)
+        self.following += 1
+        if self.edge is None or node not in self.edge:
+            is_flown = len(after) > 0 and not self.tour.is_fade(node, after[0])
+            self.edge = (min(node, after[0]), max(node, after[0])) if is_flown else self.tour.find_edge(node)
+
+    def fly(self, node: int) -> None:
+        """Turn to a panorama and fly there; straight up or down, and from near its place, the heading stays."""
+        right, down, forward = away = self.places[node] - self.camera[:3]
+        length, (seconds, longest) = float(np.linalg.norm(away)), _FLIGHT_SECONDS
+        if self.node is None and length < _NEAR:
+            seconds = _TURN_SECONDS
+        else:
+            is_level = math.hypot(right, forward) > abs(down) / 10
+            self.turn((math.atan2(right, forward) if is_level else self.camera[3], 0.0))
+            seconds = min(max(seconds + _METRE_SECONDS * (length - _SHORT), seconds), longest)
+        self.add("flight", (*self.places[node], *self.camera[3:]), seconds, node)
+
+    def find_way(self, start: int, end: int) -> tuple[float, float] | None:
+        """Yaw and pitch from a panorama to another one: of its place, or of the link to it; None if unknown."""
+        link, away = self.tour.find_direction(start, end), self.places[end] - self.places[start]
+        if link is not None and self.tour.is_fade(start, end):
+            yaw, pitch = find_angles(self.level.T @ link)
+            return yaw, max(pitch, _LOWEST)
+        return (math.atan2(away[0], away[2]), 0.0) if self.tour.worlds[start] == self.tour.worlds[end] else None
+
+    def find_arrival(self, start: int, end: int) -> Sequence[float]:
+        """Yaw and pitch at the end of a zoom: away from the link back, else the start view, else that of the way."""
+        if (back := self.tour.find_direction(end, start)) is not None:
+            right, _, forward = -(self.level.T @ back)
+            return math.atan2(right, forward), 0.0
+        is_known = self.tour.worlds[start] == self.tour.worlds[end] or end not in self.outlooks
+        return self.find_start_view(end) or (
+            self.camera[3:].tolist() if is_known else (find_widest(self.outlooks[end]), 0.0)
+        )
+
+    def find_start_view(self, node: int) -> tuple[float, float] | None:
+        """Yaw and pitch of the view that a visitor of a panorama sees first."""
+        view = self.tour.find_start_view(node)
+        return None if view is None else find_angles(self.level.T @ view)
 
 
 def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
@@ -166,101 +281,13 @@ def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
     return math.atan2(direction[0], direction[2]), math.asin(min(max(-float(direction[1]), -1.0), 1.0))
 
 
-def _find_arrival(tour: TourGraph, start: int, end: int) -> tuple[float, float] | None:
-    """Yaw and pitch of a camera after a fade; None to keep the heading."""
-    back, view = find_way_along_link(tour, end, start), tour.find_start_view(end)
-    if view is not None:
-        return find_angles(tour.level_axes.T @ view)
-    return None if back is None else find_angles(-tour.level_axes.T @ back / np.linalg.norm(back))
+def find_offset(pose: Float[np.ndarray, "4 4"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """From a panorama to a camera beside it, in its axes, as a fraction of the usual distance of surfaces."""
+    offset = pose[:3, :3].T @ (position - pose[:3, 3]) / _SURFACES
+    return offset * min(_MOST_BESIDE / max(float(np.linalg.norm(offset)), 1e-9), 1.0)
 
 
-def _fly(
-    path: Float[np.ndarray, "place 3"],
-    legs: Sequence[int],
-    before: int,
-    yaw: float | None,
-    pitch: float,
-    around: float = 0.0,
-    arrival: Callable[[float], tuple[float, float]] | None = None,
-) -> tuple[np.ndarray, ...]:
-    """The flight through places of one part: right, down, forward, yaw, pitch and leg of each sample.
-
-    Args:
-        path: places (right, down, forward).
-        legs: of the steps between them.
-        before: the leg that leads to this part, during which the camera stands.
-        yaw: at the start, radians; None looks along the path.
-        pitch: at the start, radians.
-        around: turn to the right at the end, radians.
-        arrival: yaw and pitch of the end, of the yaw with which the camera arrives.
-    """
-    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    kept = lengths > 1e-6
-    lengths, numbers = lengths[kept], np.array(legs, dtype=int)[kept]
-    path = path[np.concatenate(([True], kept))]
-    if not len(lengths):
-        numbers = np.array([before])
-    ends = np.concatenate(([0.0], np.cumsum(lengths)))
-    stops = [*ends[_find_turns_back(path)], ends[-1]]
-    place, step = 0.0, 1 / _SAMPLES_PER_SECOND
-    places, yaws = [place], [yaw]
-    while place < ends[-1]:
-        stop = next(end for end in stops if end > place)
-        heading = _look_ahead(path, ends, place, stop)
-        if yaw is None or heading is None:
-            yaw = heading or yaw or 0.0
-        error = 0.0 if heading is None else math.remainder(heading - yaw, 2 * math.pi)
-        limit = math.radians(_TURN_DEGREES) * step
-        yaw += min(max(error, -limit), limit)
-        slower = max(1 - abs(error) / math.radians(_TURN_IN_PLACE_DEGREES), 0.0)
-        place = min(place + _FLY_SPEED * slower * step, stop)
-        if stop - place < 1e-3:
-            place = stop
-        places.append(place)
-        yaws.append(yaw)
-    yaws[0] = yaws[1] if len(yaws) > 1 and yaws[0] is None else yaws[0] or 0.0
-    end = None if arrival is None else arrival(yaws[-1])
-    if end is not None:
-        around += math.remainder(end[0] - yaws[-1], 2 * math.pi)
-    turns = (math.copysign(1, around) * np.arange(0, abs(around), math.radians(_TURN_DEGREES) * step)).tolist()
-    places += [place for _ in turns]
-    yaws += [yaws[-1] + turn for turn in turns]
-    along = np.array(places)
-    pitches = np.zeros(len(yaws))
-    pitches[0] = pitch
-    if end is not None:  # the camera looks up or down while it turns, or at the end
-        pitches[-len(turns) - 1 :] = np.linspace(0, end[1], len(turns) + 2)[1:]
-    positions = [np.interp(along, ends, column) for column in path.T]
-    numbers = numbers[np.clip(np.searchsorted(ends, along, side="right") - 1, 0, len(numbers) - 1)]
-    half = round(_SMOOTHING_SECONDS / 2 * _SAMPLES_PER_SECOND)
-    smooth = [_smooth(values, half) for values in (*positions, np.array(yaws), pitches)]
-    numbers = np.pad(numbers, half, mode="edge")
-    if before >= 0:
-        numbers[:half] = before
-    return *smooth, numbers
-
-
-def _find_turns_back(path: Float[np.ndarray, "place 3"]) -> list[int]:
-    """The inner places at which a path turns by more than `_TURN_BACK_DEGREES`."""
-    steps = np.diff(path, axis=0)
-    steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    cosines = (steps[1:] * steps[:-1]).sum(axis=1)
-    return [i for i, cosine in enumerate(cosines, start=1) if cosine < math.cos(math.radians(_TURN_BACK_DEGREES))]
-
-
-def _look_ahead(
-    path: Float[np.ndarray, "place 3"], ends: Float[np.ndarray, "place"], place: float, stop: float
-) -> float | None:
-    """Yaw towards the point ahead on the path, not beyond `stop`; None if that is straight up or down."""
-    ahead = min(place + _LOOK_AHEAD, stop)
-    if ahead - place < 0.3:  # near a stop: the direction in which it is approached
-        place = max(ahead - 0.3, ends[np.searchsorted(ends, stop) - 1])
-    here, there = (np.array([np.interp(at, ends, column) for column in path.T]) for at in (place, ahead))
-    along = there - here
-    return math.atan2(along[0], along[2]) if math.hypot(along[0], along[2]) > 1e-3 else None
-
-
-def _smooth(values: Float[np.ndarray, "sample"], half: int) -> Float[np.ndarray, "sample_2"]:
-    """The values convolved with a Hann window; the first and the last value are kept, and `half` samples are added."""
-    window = np.hanning(2 * half + 3)[1:-1]
-    return np.convolve(np.pad(values, 2 * half, mode="edge"), window / window.sum(), mode="valid")
+def ease(fraction: float) -> float:
+    """From 0 to 1 without a speed at either end."""
+    t = min(max(fraction, 0.0), 1.0)
+    return t * t * (3 - 2 * t)

@@ -6,12 +6,17 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from torch import Tensor
 
+from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Scene
 
+RAYS = 360  # around a camera, of which walls are measured
 OPAQUE = 0.5  # least opacity of the surfaces that hide and block
 _ROWS, _COLUMNS = 180, 360  # of equal solid angles
+
+Outline = Float[np.ndarray, "corner 2"]
 
 
 def locate_surfaces(
@@ -25,13 +30,21 @@ def locate_surfaces(
         level: axes of a level camera, as columns right, down and forward.
         min_opacity: Gaussians of lower opacity are left out.
     """
+    means, center = scene.gaussians.means[_show(scene, view, min_opacity)], scene.cam2world[view, :3, 3]
+    return (means.double().cpu().numpy() - center.double().cpu().numpy()).dot(level)
+
+
+def find_colors(scene: Scene, view: int, *, min_opacity: float) -> Float[np.ndarray, "n 3"]:
+    """The colours, without those of higher degrees of harmonics, of the Gaussians of `locate_surfaces`, in [0, 1]."""
+    harmonics = scene.gaussians.harmonics[_show(scene, view, min_opacity), 0]
+    return (0.5 + SH_0 * harmonics).clamp(0, 1).double().cpu().numpy()
+
+
+def _show(scene: Scene, view: int, min_opacity: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians show the surfaces of a view. Coarse levels have Gaussians behind the surfaces."""
     gaussians = scene.gaussians
-    # Coarse levels have Gaussians behind the surfaces.
     shown = (gaussians.views == view) & (gaussians.opacities > min_opacity) & (gaussians.levels <= 1)
-    shown &= gaussians.means.isfinite().all(dim=1)
-    return (gaussians.means[shown].double().cpu().numpy() - scene.cam2world[view, :3, 3].double().cpu().numpy()).dot(
-        level
-    )
+    return shown & gaussians.means.isfinite().all(dim=1)
 
 
 def sample_surfaces(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
@@ -80,3 +93,27 @@ def locate_ends(
     positions = scene.cam2world[:, :3, 3].double().cpu().numpy()
     surfaces = {node: locate_surfaces(scene, view[node], np.eye(3), min_opacity=OPAQUE) for node in ends}
     return inside, surfaces, {node: positions[view[node]] for node in ends}
+
+
+def ray_angles() -> Float[np.ndarray, "ray"]:
+    """Azimuths from forward to the right, radians."""
+    return (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS
+
+
+def ray_directions() -> Float[np.ndarray, "ray 2"]:
+    angles = ray_angles()
+    return np.stack((np.sin(angles), np.cos(angles)), axis=1)
+
+
+def meet_outline(center: Float[np.ndarray, "2"], outline: Outline) -> tuple[np.ndarray, np.ndarray]:
+    """Distance at which each ray meets the outline, and the number of that wall; infinite and -1 if it does not."""
+    rays, along = ray_directions(), np.roll(outline, -1, axis=0) - outline
+    cross = rays[:, None, 0] * along[:, 1] - rays[:, None, 1] * along[:, 0]
+    offset = outline - center
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / cross
+        position = (offset[:, 0] * rays[:, None, 1] - offset[:, 1] * rays[:, None, 0]) / cross
+    distance = np.where((distance > 0) & (position >= 0) & (position <= 1), distance, np.inf)
+    nearest = distance.argmin(axis=1)
+    reached = distance[np.arange(RAYS), nearest]
+    return reached, np.where(np.isfinite(reached), nearest, -1)

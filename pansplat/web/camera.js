@@ -3,7 +3,7 @@
 // origin. Matrices are arrays of rows.
 
 import {
-  clamp, closestOnEdge, column, DEGREE, distanceOf, dot, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
+  clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
 } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
@@ -37,23 +37,27 @@ export function turn(yaw, pitch) {
 // near the panoramas of a scene without edges; steps away from them become shorter near the limit. Nothing walks along poor
 // edges, or into surfaces.
 export function walk(right, up, forward) {
-  if (state.doll.isOn || !state.sorted) return;
+  const limit = HEADER.limits[currentPart()];
+  if (state.doll.isOn || !state.sorted || !limit) return;
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const step = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
   const target = limitStep(GRAPH, camera.position, step, currentPart());
   const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : findSpot(target).position;
-  const limit = HEADER.limits[currentPart()], before = distanceOf(camera.position, from), after = distanceOf(target, from);
+  const before = distanceOf(camera.position, from), after = distanceOf(target, from);
   const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
   const allowed = Math.min(after - (1 - slower) * outward, limit);
   camera.position = after > allowed ? plus(from, scaled(minus(target, from), allowed / after)) : target;
   changed();
 }
 
+const nearestOf = (nodes, position) => nodes[indexOfLeast(nodes.map((node) => distanceOf(GRAPH.positions[node], position)))];
+
 // The nearest panorama, in a tour of the camera's part.
-export function nearestNode(position) {
-  return indexOfLeast(GRAPH.positions.map((place, node) => parts[node] === currentPart() ? distanceOf(place, position) : Infinity));
-}
+export const nearestNode = (position) => nearestOf([...parts.keys()].filter((node) => parts[node] === currentPart()), position);
+
+// Whether the camera is where there are photographs and no Gaussians; it stays at them.
+export const isFixed = () => HEADER.limits[currentPart()] === 0;
 
 // The panorama at the camera, or that from which it looked at the doll's house.
 export const nodeHere = () => state.doll.isOn ? state.doll.node : nearestNode(camera.position);
@@ -69,8 +73,10 @@ export function cameraFor({ position, yaw, pitch, fov }) {
   if (position !== undefined) {
     check("position", [0, 1, 2].map((k) => position[k]));
     const near = edges.length ? nearestEdge(GRAPH, position) : null;
-    const from = near === null ? findSpot(position).position : closestOnEdge(GRAPH, near, position);
-    const limit = HEADER.limits[near === null ? 0 : partOfEdge(GRAPH, near)], away = distanceOf(position, from);
+    const limit = HEADER.limits[near === null ? 0 : partOfEdge(GRAPH, near)];
+    const closest = near !== null && closestOnEdge(GRAPH, near, position), ends = near !== null && edges[near].slice(0, 2);
+    const from = near === null ? findSpot(position).position : limit ? closest : GRAPH.positions[nearestOf(ends, closest)];
+    const away = distanceOf(position, from);
     found.position = plus(from, scaled(minus(position, from), Math.min(limit / Math.max(away, 1e-9), 1)));
   }
   check("angles", [yaw, pitch, fov].filter((value) => value !== undefined));
@@ -93,7 +99,7 @@ export function floorPoint(position) {
 const AHEAD = 0.55;                 // exponent of the weight of a view straight ahead
 const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
 export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
-export const DOLLY_MS = 500;               // of a fade along a poor edge
+export const ZOOM_MS = 700;
 
 // Weights of the views of a group in a picture of a position and a direction: blend_weights of pansplat. Other views
 // have weight 0.
@@ -132,7 +138,7 @@ export function updateEdge(now) {
   const { fade } = state;
   if (fade) {
     const t = clamp((now - fade.began) / FADE_MS, 0, 1);
-    fade.done = t * t * (3 - 2 * t);
+    fade.done = ease(t);
     if (t === 1) state.fade = null;
     changed();
     return;

@@ -1,7 +1,10 @@
 // What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
 
-import { clamp, distanceOf } from "./graph.js";
+import { clamp, column, distanceOf, dot, minus } from "./graph.js";
 import { edges, GRAPH, parts } from "./state.js";
+
+const LEVEL_WAY = 0.1;    // metres, of a way whose heading is known
+const LOWEST_WAY = -0.2;  // radians, of a picture that shows a way
 
 const isFlown = (from, to) => {
   return edges.length ? edges.some(([a, b]) => (a === from && b === to) || (a === to && b === from)) : parts[from] === parts[to];
@@ -9,12 +12,12 @@ const isFlown = (from, to) => {
 
 // The rings of a panorama, `{ node, link }`: those of its photograph's links, on the floor where the link meets it or where the
 // other camera stands; those where its flights end, unless a surface hides them; and its own. Of another room only one.
-// Where all flights are hidden, the nearest one stays.
+// Where all flights are hidden, the nearest one stays; where nothing leads on, what leads here.
 export function chooseRings(here) {
   const { rooms } = HEADER.plan, { hidden } = HEADER.spots[here];
-  const roomOf = (node) => rooms.findIndex(({ nodes }) => nodes.includes(node));
+  const roomOf = (node) => rooms.findIndex((nodes) => nodes.includes(node));
   const away = (node) => distanceOf(GRAPH.positions[node], GRAPH.positions[here]);
-  const links = HEADER.links.filter(({ from }) => from === here), linked = links.map(({ to }) => to);
+  const all = HEADER.links, links = all.filter(({ from }) => from === here), linked = links.map(({ to }) => to);
   const flown = HEADER.spots.map((_, node) => node).filter((node) => node !== here && isFlown(here, node) && !linked.includes(node));
   flown.sort((a, b) => away(a) - away(b));
   const seen = flown.filter((node) => !hidden.includes(node));
@@ -22,6 +25,7 @@ export function chooseRings(here) {
     ...links.filter((link) => link.mark || parts[link.to] === parts[here]).map((link) => ({ node: link.to, link: link.mark ? link : null })),
     ...(seen.length || links.length ? seen : flown.slice(0, 1)).map((node) => ({ node, link: null })),
   ];
+  if (!offered.length) offered.push(...all.filter(({ to }) => to === here).map(({ from }) => ({ node: from, link: null })));
   const first = offered.filter(({ node }, k) => {
     const room = roomOf(node), isBefore = (other) => other.node === node || room >= 0 && roomOf(other.node) === room;
     return room >= 0 && room === roomOf(here) || !offered.slice(0, k).some(isBefore);
@@ -31,36 +35,27 @@ export function chooseRings(here) {
 
 export const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
 
-const DIRECTIONS = 24;  // of the bits of `turned`
+// Yaw and pitch in the direction of a position, level; null straight above and below.
+export function headingTo(position, from) {
+  const [right, , forward] = [0, 1, 2].map((k) => dot(column(HEADER.level, k), minus(position, from)));
+  return Math.hypot(right, forward) > LEVEL_WAY ? { yaw: Math.atan2(right, forward), pitch: 0 } : null;
+}
 
-// Yaw and pitch at the end of a way to a panorama, by the table of choose_arrival (pansplat/tours/outlook.py). From another part
-// the camera comes away from the link back; without one, the directions of another world are unknown.
-export function chooseArrival(node, { yaw, pitch }, from = node) {
-  const { turned, ahead } = HEADER.spots[node], { worlds } = HEADER.plan, back = findLink(node, from);
-  const isElsewhere = parts[node] !== parts[from], isBack = isElsewhere && back && back.leave;
-  const end = isBack ? { yaw: back.yaw + Math.PI, pitch: 0 } : { yaw, pitch: isElsewhere ? 0 : pitch };
-  const turns = end.yaw / (2 * Math.PI) + 0.5, isUnknown = !isBack && worlds[node] !== worlds[from];
-  const isTurned = isUnknown || turned >> Math.floor(DIRECTIONS * (turns - Math.floor(turns))) & 1;
-  return isTurned ? { yaw: ahead[0], pitch: ahead[1] } : end;
+// Yaw and pitch of the way from one panorama to another that is no flight: that of its link, which may be on the floor, else
+// of a place that is known; null where it is unknown.
+export function findHeading(from, to) {
+  const link = findLink(from, to), { worlds } = HEADER.plan;
+  if (link) return { yaw: link.yaw, pitch: Math.max(link.pitch, LOWEST_WAY) };
+  return worlds[from] === worlds[to] ? headingTo(GRAPH.positions[to], GRAPH.positions[from]) : null;
+}
+
+// Yaw and pitch at the end of a way with a heading: the start view of the panorama, else the heading, or the widest view where no
+// heading is known. What is no flight comes away from the link back.
+export function chooseArrival(node, heading, from = null) {
+  const { ahead: [yaw, pitch], hasStart } = HEADER.spots[node], back = from !== null && findLink(node, from);
+  if (back) return { yaw: back.yaw + Math.PI, pitch: 0 };
+  return hasStart || !heading ? { yaw, pitch } : { yaw: heading.yaw, pitch: 0 };
 }
 
 // Whether two boxes have a place in common; `[left, top, right, bottom]`.
 export const isCovered = (a, b) => a[0] <= b[2] && a[2] >= b[0] && a[1] <= b[3] && a[3] >= b[1];
-
-const DOT = 7, GAP = 3;  // pixels: half of a panorama's dot in the plan, and between a name and the border
-
-// Where names stand in a plan: the middle of each, as near to its own as it covers neither a dot nor a name before; null where
-// there is no such place.
-export function placeNames(names, dots, [across, tall]) {
-  const taken = dots.map(([x, y]) => [x - DOT, y - DOT, x + DOT, y + DOT]);
-  return names.map(({ x, y, width, height }) => {
-    const half = 0.5 * width + GAP, middle = clamp(x, half, Math.max(across - half, half));
-    for (const step of [0, -1, 1, -2, 2, -3, 3]) {
-      const at = y + 0.6 * step * height, box = [middle - half, at - 0.5 * height, middle + half, at + 0.5 * height];
-      if (box[1] < 0 || box[3] > tall || taken.some((other) => isCovered(box, other))) continue;
-      taken.push(box);
-      return [middle, at];
-    }
-    return null;
-  });
-}

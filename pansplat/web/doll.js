@@ -12,13 +12,22 @@ const DOLL_ZOOM = [0.15, 2];                       // of the distance from which
 const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
 
 // The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
-export const findHouse = () => HEADER.doll.find(({ nodes }) => nodes.includes(state.doll.node));
+export const findHouse = (node = state.doll.node) => HEADER.doll.find(({ nodes }) => nodes.includes(node));
 
 // Whether a panorama is in the house that is shown.
 export const isInDoll = (node) => findHouse().nodes.includes(node);
 
+// Where a place around a panorama is in the house, and what yaws there are turned by: rooms of other worlds stand beside it.
+export function placeInDoll(node, place, { nodes, moves } = findHouse()) {
+  const [turn, ...shown] = moves[nodes.indexOf(node)], [c, s] = [Math.cos(turn), Math.sin(turn)];
+  const [x, y, z] = [0, 1, 2].map((k) => dot(column(HEADER.level, k), minus(place, HEADER.spots[node].position)));
+  return { place: plus(shown, HEADER.level.map((row) => dot(row, [c * x + s * z, y, c * z - s * x]))), turn };
+}
+
 // The first camera outside, from which all rooms are in a picture of a size.
 export function frameDoll(size) {
+  const { place, turn } = placeInDoll(state.doll.node, camera.position);
+  Object.assign(camera, { position: place, yaw: camera.yaw + turn });
   const places = findHouse().corners.map((place) => [0, 1, 2].map((k) => dot(column(HEADER.level, k), place)));
   const box = ["min", "max"].map((end) => [0, 1, 2].map((k) => places.reduce((found, place) => Math[end](found, place[k]), places[0][k])));
   const yaws = [camera.yaw, camera.yaw + 0.5 * Math.PI];  // the one that is nearer to the rooms
@@ -29,20 +38,27 @@ export function frameDoll(size) {
   return { position: placeOutside(yaws[best], DOLL_PITCH), yaw: yaws[best], pitch: DOLL_PITCH, fov: DOLL_FOV };
 }
 
-// The distance from which places around the middle are in the picture.
-function fit(offsets, yaw, pitch, [width, height]) {
-  const rotation = turned(yaw, pitch), tall = tangentOf(width, height, DOLL_FOV), wide = tall * width / height;
+// The share of the picture that the floor plan covers at its left, and half of the width of the picture at a distance of 1.
+function frame([width, height]) {
+  return [Math.min(state.doll.covered / width, 0.5), tangentOf(width, height, DOLL_FOV) * width / height];
+}
+
+// The distance from which places around the middle are in the picture, beside the floor plan.
+function fit(offsets, yaw, pitch, size) {
+  const rotation = turned(yaw, pitch), [covered, wide] = frame(size), tall = wide * size[1] / size[0];
   const needed = offsets.map((offset) => {
     const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-    return Math.max(Math.abs(x) / wide - z, Math.abs(y) / tall - z);
+    return Math.max((x / wide - z) / (1 - covered), ((2 * covered - 1) * z - x / wide) / (1 - covered), Math.abs(y) / tall - z);
   });
   return 1.05 * needed.reduce((most, each) => Math.max(most, each));
 }
 
 // Where a camera with these angles sees all rooms, unless a visitor has come nearer.
 function placeOutside(yaw, pitch) {
-  const { center, offsets, size, first, zoom } = state.doll, forward = HEADER.level.map((row) => dot(row, column(turned(yaw, pitch), 2)));
-  return minus(center, scaled(forward, zoom * Math.max(first, fit(offsets, yaw, pitch, size))));
+  const { center, offsets, size, first, zoom } = state.doll, [covered, wide] = frame(size);
+  const [right, , forward] = [0, 1, 2].map((k) => HEADER.level.map((row) => dot(row, column(turned(yaw, pitch), k))));
+  const distance = zoom * Math.max(first, fit(offsets, yaw, pitch, size));
+  return minus(center, scaled(plus(forward, scaled(right, covered * wide)), distance));
 }
 
 export function orbit(yaw, pitch) {
@@ -75,12 +91,11 @@ export function orbitByKeys([right, up, forward], seconds) {
 
 // The panorama of the rooms nearest to a point.
 export const nearestInDoll = (point) => {
-  return indexOfLeast(HEADER.spots.map(({ position }, node) => isInDoll(node) ? distanceOf(position, point) : Infinity));
+  return indexOfLeast(HEADER.spots.map(({ position }, node) => isInDoll(node) ? distanceOf(placeInDoll(node, position).place, point) : Infinity));
 };
 
 // The distance to the first front of the house along a ray; null without one. Corners are clockwise in front.
-export function meetHouse(origin, ray) {
-  const { corners } = findHouse();
+export function meetHouse(origin, ray, { corners } = findHouse()) {
   let nearest = null;
   for (let first = 0; first < corners.length; first += 3) {
     const [a, b, c] = corners.slice(first, first + 3), normal = cross(minus(b, a), minus(c, a)), toward = dot(normal, ray);

@@ -1,27 +1,25 @@
-// Ways of the camera that need no hand: flights along edges, the flight through all panoramas, and jumps, which fade: the
-// image of the camera before covers the new one until that is sorted, then it fades out.
+// Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump fades:
+// the image of the camera before covers the new one until that is there, then it fades out; that of a zoom grows.
 
-import { cameraFor, DOLLY_MS, FADE_MS, nearestNode, nodeHere, rotationOf, settleAt, turn } from "./camera.js";
-import { chooseArrival, findLink } from "./choices.js";
-import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit } from "./doll.js";
+import { cameraFor, FADE_MS, isFixed, nearestNode, nodeHere, settleAt, turn, ZOOM_MS } from "./camera.js";
+import { chooseArrival, findHeading, headingTo } from "./choices.js";
+import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit, placeInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
-import {
-  clamp, column, distanceOf, dot, findWay, followEdge, isFade, lengthOf, minus, nearestEdge, partOfEdge, plus, scaled,
-} from "./graph.js";
-import { photographs } from "./photographs.js";
+import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isFade, minus, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
+import { photographs, STANDS } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
 import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, parts, state } from "./state.js";
 
 const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into one
-const TURN_SPEED = Math.PI / 2;     // radians a second, towards a link
+const TURN_SECONDS = 0.4, WHOLE_TURN = 45 * DEGREE;  // of a turn at a photograph; a smaller one is shorter
+const ZOOM = 2 / 3;                 // of the field of view, at the end of a zoom
+const MAX_STILL = 8e6;              // pixels of its image
 const NEAR = HEADER.speed;          // metres: a second's walk
-const ZOOM = 0.4;                   // of the image before, while it fades along a poor edge
-export const PHOTO_WAIT_MS = 2000;  // for a photograph, at most: of a fade along a poor edge where it ends, and of the first Gaussians
-const REST_SECONDS = 4;             // at a panorama, on a tour without flights
+export const PHOTO_WAIT_MS = 2000;  // for a photograph, at most: where a zoom ends, and of the first Gaussians
+const REST_SECONDS = 3;             // at a panorama, on a tour
 
-// `zoom`: of the image of before, by which a fast fade along a poor edge looks like a step.
-export function jump(position, { yaw, pitch }, zoom = null) {
-  takeStill(zoom);
+export function jump(position, { yaw, pitch }, isZoom = false) {
+  takeStill(isZoom);
   place({ position: [...position], yaw, pitch });
 }
 
@@ -74,16 +72,15 @@ function enterDoll() {
 
 const canShowDoll = () => state.sorted !== null && byId("atlas")?.complete === true;
 
-// Flies into a panorama, and ends there; by default it looks where the camera looks from outside.
-function visit(node, heading = chooseArrival(node, { yaw: camera.yaw, pitch: 0 })) {
+// Flies into a panorama, and ends there; by default in its start view, or its widest one.
+function visit(node, heading = chooseArrival(node, null)) {
   if (!isInDoll(node)) {
     jumpTo(node);
     return;
   }
   state.doll.node = node;
-  flyDoll({ position: [...HEADER.spots[node].position], ...heading, fov: state.doll.fov }, () => {
-    jump(HEADER.spots[node].position, heading);
-  });
+  const { position } = HEADER.spots[node], { place, turn } = placeInDoll(node, position);
+  flyDoll({ position: place, ...heading, yaw: heading.yaw + turn, fov: state.doll.fov }, () => jump(position, heading));
 }
 
 // Goes to the panorama nearest to what a point of the window shows.
@@ -125,126 +122,75 @@ export function advanceDollFlight(now) {
 
 // ---- flights and jumps ----
 
-// A smooth flight to a panorama along the edges; the direction of view stays the user's. To another part, the camera
-// turns to the link, goes a step along it, and the image fades; without a link it fades at once.
+// The camera goes to a panorama along the edges. On each step it turns to the way, then it flies, looking ahead, or the image
+// grows and fades. A leg has what changes: a `view` to turn to, a `path` of two places, or a `view` after a fade to the
+// panorama `to`.
 export function flyTo(spot) {
   if (state.doll.isOn) {
     visit(spot);
     return;
   }
-  if (calm.matches) {
-    state.flight = { spot, legs: [{ from: edges.length ? nearestNode(camera.position) : spot, to: spot }], began: null };
-    if (state.isTouring) state.flight.legs.push({ path: [GRAPH.positions[spot]], rest: REST_SECONDS });
-    changed();
-    return;
-  }
-  const way = edges.length ? findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge))) : [spot];
-  const legs = [];
-  let path = [[...camera.position]];
-  way.forEach((node, i) => {
-    if (i > 0 && isFade(GRAPH, way[i - 1], node)) {
-      const link = findLink(way[i - 1], node);
-      legs.push({ path });
-      if (link && link.leave) legs.push({ path: path.slice(-1), yaw: link.yaw }, { path: [path.at(-1), link.leave] });
-      legs.push({ path: [], from: way[i - 1], to: node });
-      path = [];
-    } else if (i + 1 < way.length && i === 0 && isFade(GRAPH, node, way[1])) return;  // it fades where the camera is
-    path.push(GRAPH.positions[node]);
-  });
-  legs.push({ path, end: spot });
-  state.flight = { spot, legs, began: null };
+  const { legs, end } = planWay(spot);
+  state.flight = { spot, legs: calm.matches ? [{ to: spot, view: end }] : legs, began: null };
+  if (state.isTouring) state.flight.legs.push({ rest: REST_SECONDS });
   changed();
 }
 
-export const ease = (t) => t * t * t * (t * (6 * t - 15) + 10);
+// The legs of a way, and yaw and pitch at its end.
+function planWay(spot) {
+  const part = edges.length ? partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)) : 0;
+  const way = edges.length ? findWay(GRAPH, camera.position, spot, part) : [spot];
+  const here = nodeHere(), isThere = distanceOf(camera.position, GRAPH.positions[here]) <= STANDS;
+  const legs = [];
+  let from = isThere ? here : null, position = [...camera.position], end = chooseArrival(spot, camera);
+  way.forEach((node, i) => {
+    const before = i > 0 ? way[i - 1] : null, isZoom = before !== null && isFade(GRAPH, before, node);
+    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node);  // a zoom begins where the camera is
+    if (node === from || isLeft) return;
+    const heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || camera;
+    if (heading) legs.push({ view: { yaw: heading.yaw, pitch: heading.pitch } });
+    end = chooseArrival(node, heading, isZoom ? before : null);
+    legs.push(isZoom ? { to: node, view: end } : { from, to: node, path: [position, GRAPH.positions[node]] });
+    [from, position] = [node, GRAPH.positions[node]];
+  });
+  if (!legs.length || legs.at(-1).path && HEADER.spots[spot].hasStart) legs.push({ view: end });
+  return { legs, end };
+}
 
 export function advanceFlight(now) {
-  if (!state.flight || isWaiting()) return;
-  const leg = state.flight.legs[0];
-  if (leg.to !== undefined) {
-    const isElsewhere = parts[leg.from] !== parts[leg.to], isDolly = !isElsewhere && isFade(GRAPH, leg.from, leg.to) && !calm.matches;
-    jump(GRAPH.positions[leg.to], chooseArrival(leg.to, camera, leg.from), isDolly ? zoomTowards(GRAPH.positions[leg.to]) : null);
-    state.flight.legs.shift();
-    if (!state.flight.legs.length) state.flight = null;
-    return;
-  }
-  if (state.flight.began === null) beginLeg(leg, now);
-  const t = leg.seconds ? clamp((now - state.flight.began) / (1000 * leg.seconds), 0, 1) : 1;
-  const isMoving = leg.length > 0 || leg.turn.some((angle) => angle);
-  if (isMoving) {
-    if (leg.length) camera.position = t < 1 ? pointAlong(leg.path, ease(t) * leg.length) : [...leg.path.at(-1)];
-    turn(leg.turn[0] * (ease(t) - leg.done), leg.turn[1] * (ease(t) - leg.done));  // a drag adds to it
-    leg.done = ease(t);
-  }
+  const { flight } = state;
+  if (!flight || isWaiting() || state.still?.isZoom) return;
+  const [leg] = flight.legs;
+  if (flight.began === null) beginLeg(leg, now);
+  const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1, step = ease(t) - leg.done;
+  leg.done = ease(t);
+  if (leg.turn) turn(leg.turn[0] * step, leg.turn[1] * step);  // a drag adds to it
+  if (leg.path) camera.position = t < 1 ? plus(leg.path[0], scaled(minus(leg.path[1], leg.path[0]), leg.done)) : [...leg.path[1]];
+  if (leg.path) changed();
   if (t < 1) return;
-  state.flight.began = null;
-  state.flight.legs.shift();
-  if (state.flight.legs.length) {
-    if (!isMoving) advanceFlight(now);  // a fade begins with the picture at rest, which has the full resolution
+  if (leg.to !== undefined && !leg.path) jump(GRAPH.positions[leg.to], leg.view, !calm.matches);
+  flight.began = null;
+  flight.legs.shift();
+  if (flight.legs.length) {
+    if (!leg.seconds && leg.to === undefined) advanceFlight(now);  // a zoom begins with the picture at rest, which has the full resolution
     return;
   }
-  const { spot } = state.flight;
   state.flight = null;
-  if (state.isTouring) flyTo((spot + 1) % HEADER.spots.length);
+  if (state.isTouring) flyTo(nextOnTour(flight.spot));
 }
 
-// Of an image, as of a camera that comes nearer; none if the way leads to the side or back.
-function zoomTowards(position) {
-  const way = minus(position, camera.position);
-  return ZOOM * Math.max(dot(column(rotationOf(camera), 2), way) / Math.max(Math.hypot(...way), 1e-9), 0);
-}
+const nextOnTour = (node) => HEADER.walk[(HEADER.walk.indexOf(node) + 1) % HEADER.walk.length];
 
 function beginLeg(leg, now) {
   state.flight.began = now;
-  leg.length = lengthOf(leg.path);
   leg.done = 0;
-  const { yaw, pitch } = leg.yaw !== undefined ? { yaw: leg.yaw, pitch: 0 } : leg.end !== undefined ? chooseArrival(leg.end, camera) : camera;
-  const across = state.headset.session ? 0 : Math.atan2(Math.sin(yaw - camera.yaw), Math.cos(yaw - camera.yaw));
-  leg.turn = [across, pitch - camera.pitch];
-  const turning = state.headset.session ? 0 : Math.hypot(...leg.turn) / TURN_SPEED;  // the head turns itself
-  leg.seconds = leg.rest || Math.max(turning, leg.length ? clamp(1.2 * leg.length / HEADER.speed, 0.6, 3 * (leg.path.length - 1)) : 0);
-}
-
-function pointAlong(path, distance) {
-  for (let i = 1; i < path.length; i++) {
-    const step = minus(path[i], path[i - 1]), length = Math.hypot(...step);
-    if (distance < length) return plus(path[i - 1], scaled(step, distance / length));
-    distance -= length;
+  leg.seconds = leg.rest || 0;
+  if (leg.path) leg.seconds = clamp(1 + 0.1 * (distanceOf(...leg.path) - 2), 1, 1.6);
+  else if (leg.view && leg.to === undefined && !state.headset.session) {  // the head turns itself
+    const { yaw, pitch } = leg.view, across = yaw - camera.yaw;
+    leg.turn = [Math.atan2(Math.sin(across), Math.cos(across)), pitch - camera.pitch];
+    leg.seconds = TURN_SECONDS * Math.min(Math.hypot(...leg.turn) / WHOLE_TURN, 1);
   }
-  return [...path.at(-1)];
-}
-
-// The flight through all panoramas of a tour. It begins at the point of the route that is nearest to the camera, and
-// the difference in pose disappears at first. The camera turns with the route; a drag adds to it until a fade.
-function startRoute() {
-  const distances = HEADER.route.map((sample) => distanceOf(sample.slice(0, 3), camera.position));
-  const least = Math.min(...distances) + 0.02 * NEAR;
-  const first = distances.findIndex((distance) => distance <= least), sample = HEADER.route[first];
-  const offset = minus([...camera.position, camera.yaw, camera.pitch], sample);
-  offset[3] -= 2 * Math.PI * Math.round(offset[3] / (2 * Math.PI));
-  const time = first / HEADER.routeRate, seconds = Math.max(1, Math.abs(offset[3]) / TURN_SPEED);
-  state.route = { time, began: time, seconds, last: null, offset };
-}
-
-export function advanceRoute(seconds) {
-  if (!state.route || isWaiting()) return;
-  const end = HEADER.route.length - 1, before = Math.floor(state.route.time * HEADER.routeRate);
-  state.route.time += seconds;
-  const at = Math.min(state.route.time * HEADER.routeRate, end), index = Math.min(Math.floor(at), end - 1);
-  if (HEADER.jumps.some((jumped) => before <= jumped && jumped < index)) {
-    const [x, y, z, yaw, pitch] = HEADER.route[index];
-    jump([x, y, z], { yaw, pitch });
-    Object.assign(state.route, { time: index / HEADER.routeRate, offset: [0, 0, 0, 0, 0], last: { yaw, pitch } });
-    return;
-  }
-  const fraction = HEADER.jumps.includes(index) ? 0 : at - index;
-  const sample = plus(HEADER.route[index], scaled(minus(HEADER.route[index + 1], HEADER.route[index]), fraction));
-  const left = 1 - ease(clamp((state.route.time - state.route.began) / state.route.seconds, 0, 1));
-  const [x, y, z, yaw, pitch] = plus(sample, scaled(state.route.offset, left));
-  camera.position = [x, y, z];
-  turn(yaw - (state.route.last ? state.route.last.yaw : yaw), pitch - (state.route.last ? state.route.last.pitch : pitch));
-  state.route.last = { yaw, pitch };
-  if (at === end) setTouring(false);
 }
 
 export function setTouring(value) {
@@ -253,19 +199,13 @@ export function setTouring(value) {
   if (state.isTouring && state.doll.isOn) jump(GRAPH.positions[state.doll.node], state.doll.heading);
   byId("play").setAttribute("aria-pressed", state.isTouring);
   byId("play").querySelector("path").setAttribute("d", state.isTouring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
-  if (!state.isTouring) Object.assign(state, { flight: null, route: null });
-  else if (HEADER.route.length > 1 && !calm.matches) {
-    state.flight = null;
-    startRoute();
-  } else if (!state.flight) {
-    flyTo((nearestNode(camera.position) + 1) % GRAPH.positions.length);
-  }
+  if (!state.isTouring) state.flight = null;
+  else if (!state.flight) flyTo(nextOnTour(nodeHere()));
   changed();
 }
 
 export function goHome() {
   setTouring(false);
-  state.flight = null;
   goToPose(makeStart());
 }
 
@@ -286,53 +226,61 @@ export function goTo(node) {
 // Goes to a panorama without a flight.
 export function jumpTo(node) {
   setTouring(false);
-  jump(GRAPH.positions[node], chooseArrival(node, camera, edges.length ? nodeHere() : node));
+  jump(GRAPH.positions[node], state.doll.isOn ? chooseArrival(node, null) : planWay(node).end);
 }
 
-export const isFlying = () => state.flight !== null || state.route !== null;
+export const isFlying = () => state.flight !== null;
 
 // The still, the image of the last camera before a jump, covers the new one until that is sorted, then it fades out.
 const stillCanvas = byId("still");
 
-export function takeStill(zoom = null) {
+// That of a zoom is large enough to grow.
+export function takeStill(isZoom = false) {
   if (!state.renderer || !state.sorted) return;
-  if (state.headset.session) {  // it fades from black
-    state.still = { taken: null, began: null, left: 1, position: null, zoom: null };
-    return;
-  }
-  const size = fullSize();  // a photograph is drawn fast
-  drawAt(...(photographs.isOpaque ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
+  const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * ZOOM * camera.fov * DEGREE) : 1;
+  state.still = { taken: null, began: null, left: 1, position: null, isZoom, zoom };
+  if (state.headset.session) return;  // it fades from black
+  const full = fullSize(), larger = photographs.isOpaque ? Math.max(Math.min(zoom, Math.sqrt(MAX_STILL / (full[0] * full[1]))), 1) : 1;
+  const size = full.map((side) => Math.round(side * larger)), isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
+  drawAt(...(photographs.isOpaque || isZoom ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
   const context = stillCanvas.getContext("2d");
-  const isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
-  context.globalAlpha = state.still && isSame ? 1 - state.still.left : 1;
+  context.globalAlpha = stillCanvas.hidden || !isSame ? 1 : 1 - Number(stillCanvas.style.opacity);
   if (!isSame) [stillCanvas.width, stillCanvas.height] = size;
   context.drawImage(canvas, 0, 0, ...size);
-  state.still = { taken: null, began: null, left: 1, position: null, zoom };
   showStill();
   changed();
 }
 
 export function updateStill(now) {
-  if (!state.still) return;
-  state.still.taken ??= now;
-  state.still.position = state.still.position || [...camera.position];
-  const isSorted = state.doll.isOn || state.sorted.part === currentPart() && distanceOf(state.sorted.position, state.still.position) < NEAR + distanceOf(camera.position, state.still.position);
-  const isThere = state.still.zoom === null || !photographs.isExpected || now - state.still.taken > PHOTO_WAIT_MS;
-  if (state.still.began === null && (photographs.isOpaque || isSorted && isThere && isSeen())) state.still.began = now;
-  if (state.still.began !== null) {
-    const t = clamp((now - state.still.began) / (state.still.zoom === null ? FADE_MS : DOLLY_MS), 0, 1);
-    state.still.left = 1 - t * t * (3 - 2 * t);
+  const { still } = state;
+  if (!still) return;
+  still.taken ??= now;
+  still.position ??= [...camera.position];
+  if (still.began === null && isUncovered(now)) still.began = now;
+  if (still.began !== null) {
+    const t = clamp((now - still.began) / (still.isZoom ? ZOOM_MS : FADE_MS), 0, 1);
+    still.left = 1 - ease(t);
     if (t === 1) state.still = null;
   }
   showStill();
   changed();
 }
 
+// Whether what the still covers is there: the photograph, for a zoom all of it that is in the picture, or the Gaussians, where a
+// photograph is late.
+function isUncovered(now) {
+  const { still, sorted, doll } = state, isLate = now - still.taken > PHOTO_WAIT_MS;
+  if (photographs.isOpaque && (!still.isZoom || isLate || photographs.isFinal())) return true;
+  if (isFixed() && !doll.isOn && photographs.first.every(({ status }) => status !== "failed")) return false;
+  const isSorted = doll.isOn || sorted.part === currentPart() && distanceOf(sorted.position, still.position) < NEAR + distanceOf(camera.position, still.position);
+  return isSorted && (!still.isZoom || !photographs.isExpected || isLate) && isSeen();
+}
+
 function showStill() {
   const left = coverage();
   stillCanvas.hidden = !state.still || state.headset.session !== null;
   stillCanvas.style.opacity = left;
-  stillCanvas.style.transform = state.still && state.still.zoom ? `scale(${1 + state.still.zoom * (1 - left)})` : "";
+  stillCanvas.style.transform = state.still?.isZoom ? `scale(${state.still.zoom - (state.still.zoom - 1) * left})` : "";
   byId("spots").style.opacity = 1 - left;
 }
 

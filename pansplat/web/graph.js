@@ -19,8 +19,8 @@ export const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((
 export const column = (matrix, k) => matrix.map((row) => row[k]);
 export const distanceOf = (a, b) => Math.hypot(...minus(a, b));
 export const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+export const ease = (t) => t * t * (3 - 2 * t);
 export const indexOfLeast = (values) => values.indexOf(Math.min(...values));
-export const lengthOf = (path) => path.slice(1).reduce((sum, point, i) => sum + distanceOf(point, path[i]), 0);
 
 export function closestOnEdge(graph, edge, position) {
   const [from, to] = graph.edges[edge].slice(0, 2).map((node) => graph.positions[node]);

@@ -5,7 +5,7 @@ import { FADE_MS, nodeHere, showViews, tangentOf, updateEdge, walk } from "./cam
 import { orbitByKeys } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { embed } from "./embed.js";
-import { advanceDollFlight, advanceFlight, advanceRoute, isWaiting, updateStill } from "./flight.js";
+import { advanceDollFlight, advanceFlight, isWaiting, updateStill } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus, scaled } from "./graph.js";
 import { loadAround, requestSort } from "./loading.js";
 import { measure } from "./measure.js";
@@ -27,14 +27,13 @@ let lastFrame = 0;
 // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
 export function isSettled() {
   const isDrawn = state.headset.session !== null || !state.isDirty && state.drawnScale === 1, tolerance = state.headset.session ? SORT_DISTANCE : 0;
-  const isMoving = state.doll.isDue || [state.flight, state.route, state.doll.flight, state.fade, state.still].some((each) => each !== null);
+  const isMoving = state.doll.isDue || [state.flight, state.doll.flight, state.fade, state.still].some((each) => each !== null);
   return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && state.sorted.views.every((view) => shown[view] === 1);
 }
 
 // Moves what moves by itself, `seconds` after the last time.
 export function advance(now, seconds) {
   advanceFlight(now);
-  advanceRoute(seconds);
   advanceDollFlight(now);
   if (edges.length && !state.doll.isOn) updateEdge(now);
   showViews(1000 * seconds / FADE_MS);

@@ -1,15 +1,16 @@
 // The photographs of the panoramas: where the camera stands at one, its photograph is shown, and Gaussians while it moves.
 // docs/web.md describes it. Tiles of cube faces are files, or text in a page of one file. A large level is drawn over the smallest one, as far as it has arrived.
 
-import { nodeHere, rotationOf, tangentOf } from "./camera.js";
+import { isFixed, nodeHere, rotationOf, tangentOf } from "./camera.js";
 import { fullSize, say } from "./dom.js";
-import { clamp, column, distanceOf, dot, multiply, scaled } from "./graph.js";
+import { clamp, column, distanceOf, dot, minus, multiply, scaled } from "./graph.js";
 import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
-const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
-const GONE = 0.3;                   // metres from a panorama, where its photograph has faded at any rate
+export const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
 const PHOTO_FADE = 0.2;             // seconds
+const FIRST = 0.1;                  // of a flight, for which a photograph is shown at both ends; it fades over as much
+const AROUND = 2.5;                 // metres, usual distance of surfaces: so far is the photograph of a camera beside it
 const DENSITY = 1.3;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
 const AT_ONCE = 6;                  // tiles that are read at the same time
@@ -117,16 +118,30 @@ class Photographs {
     return node === null || this.listMissing(node, size, true).every(({ status }) => status === "failed");
   }
 
-  // The panorama at which the camera stands.
+  // The panorama at which the camera stands, as no eye of a headset does; the nearest where there is nothing else to show.
   findNode() {
-    const node = nodeHere();
-    return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= STANDS ? node : null;
+    const node = nodeHere(), isThere = !state.headset.session && distanceOf(GRAPH.positions[node], camera.position) <= STANDS;
+    return !state.doll.isOn && (isThere || isFixed()) ? node : null;
+  }
+
+  // What is shown of a flight: the photographs of both ends, near them.
+  findFlown() {
+    const [leg] = state.flight?.legs || [];
+    if (!leg?.path || !leg.done || state.headset.session) return null;
+    const isFirst = leg.done < 0.5, node = isFirst ? leg.from : leg.to;
+    const isReady = node !== null && this.levelsOf(node)[0].isReady;
+    return { node, opacity: isReady ? clamp(2 - (isFirst ? leg.done : 1 - leg.done) / FIRST, 0, 1) : 0 };
+  }
+
+  // The smallest tiles of the photograph at the camera.
+  get first() {
+    const node = HEADER.photographs.length && state.renderer ? this.findNode() : null;
+    return node === null ? [] : this.levelsOf(node)[0].tiles;
   }
 
   // Whether the photograph at the camera, which is not shown yet, may arrive soon.
   get isExpected() {
-    const node = HEADER.photographs.length ? this.findNode() : null;
-    return node !== null && state.renderer !== null && !this.isOpaque && this.levelsOf(node)[0].tiles.every(({ tries }) => !tries);
+    return !this.isOpaque && this.first.length > 0 && this.first.every(({ tries }) => !tries);
   }
 
   // The levels of a photograph that the device can hold, the smallest first.
@@ -152,8 +167,8 @@ class Photographs {
   }
 
   // The tiles that have not arrived: those of the smallest level, then of the chosen one those in view, then the others.
-  listMissing(node, size, isOnlySeen = false) {
-    const forward = column(rotationOf(camera), 2), tangent = tangentOf(...size);
+  listMissing(node, size, isOnlySeen = false, view = camera) {
+    const forward = column(rotationOf({ roll: 0, ...view }), 2), tangent = tangentOf(...size);
     const corner = Math.atan(Math.hypot(tangent, tangent * size[0] / size[1]));
     const away = ({ direction, reach }) => Math.acos(clamp(dot(direction, forward), -1, 1)) - reach - corner;
     const [preview] = this.levelsOf(node), level = this.chooseLevel(node, size);
@@ -170,15 +185,16 @@ class Photographs {
       this.made.clear();
       Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph), opacity: 0 });
     }
-    const node = this.findNode(), isStill = this.last !== null && distanceOf(camera.position, this.last) === 0;
+    const isStill = this.last !== null && distanceOf(camera.position, this.last) === 0 || state.headset.session !== null;
     this.last = [...camera.position];
-    this.wanted = node !== null || !state.flight ? nodeHere() : state.flight.spot;
-    this.read(this.wanted, size);
-    const isShown = isStill && node !== null && !state.headset.session && this.levelsOf(node)[0].isReady;
-    if (this.node !== null && node !== this.node) {
-      const most = state.headset.session ? 0 : 1 - distanceOf(camera.position, GRAPH.positions[this.node]) / GONE;
-      this.opacity = clamp(this.opacity, 0, Math.max(most, 0));
+    const next = state.flight?.legs.find(({ to }) => to !== undefined), flown = this.findFlown();
+    this.wanted = next ? next.to : nodeHere();
+    this.read(this.wanted, size, next?.view);
+    if (flown) {
+      Object.assign(this, { ...flown, target: flown.opacity });
+      return;
     }
+    const node = this.findNode(), isShown = node !== null && (isStill || node === this.node) && this.levelsOf(node)[0].isReady;
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
@@ -187,14 +203,14 @@ class Photographs {
     changed();
   }
 
-  read(node, size) {
+  read(node, size, view = camera) {
     for (const old of [...this.made.keys()].filter((each) => each !== node && each !== this.node).slice(0, -KEPT + 1)) {
       this.made.get(old).forEach((level) => level.release());
       this.made.delete(old);
     }
     const levels = this.levelsOf(node);
     const isThere = ({ key }) => HEADER.folder !== null || texts.has(key), now = performance.now();
-    const tiles = this.listMissing(node, size).filter((tile) => !tile.status && tile.due <= now && isThere(tile));
+    const tiles = this.listMissing(node, size, false, view).filter((tile) => !tile.status && tile.due <= now && isThere(tile));
     tiles.slice(0, Math.max(AT_ONCE - this.reading, 0)).forEach(async (tile) => {
       const level = levels.find(({ tiles: each }) => each.includes(tile));
       tile.status = "reading";
@@ -213,18 +229,19 @@ class Photographs {
         if (tile.status === "failed") say(`A part of the photograph of ${HEADER.spots[node].name} cannot be loaded`);
       }
       this.reading -= 1;
-      if (this.wanted === node && this.renderer === state.renderer) this.read(node, size);
+      if (this.wanted === node && this.renderer === state.renderer) this.read(node, size, view);
     });
   }
 
-  // Draws over the viewport of the canvas; `seen` is a camera of Renderer.draw.
-  draw({ rotation, center, half }, width, height) {
+  // Draws over a viewport of the canvas or of a framebuffer; `seen` is a camera of Renderer.draw.
+  draw({ rotation, center, half }, width, height, framebuffer = null, [left, bottom] = [0, 0]) {
     if (!this.opacity) return;
     const { gl, screen } = state.renderer, { program, places } = this.program, levels = this.levelsOf(this.node);
     const chosen = this.chooseLevel(this.node, [width, height]);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(left, bottom, width, height);
     gl.useProgram(program);
+    gl.uniform2f(places.origin, left, bottom);
     gl.uniform1i(places.preview, 0);
     gl.uniform1i(places.detail, 1);
     levels[0].bind(0);
@@ -232,6 +249,8 @@ class Photographs {
     // The rows of the inverse are the columns of the rotation; y of a cube map is up.
     const inverse = [0, 1, 2].map((k) => column(rotation, k)), turned = multiply(inverse, HEADER.photographs[this.node].rotation);
     gl.uniformMatrix3fv(places.camera_to_cube, false, turned.flatMap(([x, y, z]) => [x, -y, z]));
+    const beside = state.headset.session ? [0, 0, 0] : scaled(minus(camera.position, GRAPH.positions[this.node]), 1 / AROUND);
+    gl.uniform3fv(places.beside, inverse.map((axis) => dot(axis, beside)));
     gl.uniform4f(places.window, ...center, ...half);
     gl.uniform2f(places.size, width, height);
     gl.uniform1f(places.opacity, this.opacity);

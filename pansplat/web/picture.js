@@ -1,9 +1,9 @@
 // Pictures of the camera, and what a point of the window shows.
 
-import { blendWeights, rotationOf, tangentOf } from "./camera.js";
-import { meetHouse } from "./doll.js";
+import { blendWeights, isFixed, nodeHere, rotationOf, tangentOf } from "./camera.js";
+import { findHouse, meetHouse, placeInDoll } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
-import { dot, scaled } from "./graph.js";
+import { dot, minus, plus, scaled } from "./graph.js";
 import { drawHouse } from "./house.js";
 import { photographs } from "./photographs.js";
 import { camera, changed, state } from "./state.js";
@@ -33,9 +33,18 @@ export function rayOf(left, top) {
 export function measureAt(left, top) {
   if (!state.renderer || !state.sorted) return null;
   if (state.doll.isOn) return meetHouse(camera.position, rayOf(left, top));
+  if (isFixed()) return measureRoom(nodeHere(), rayOf(left, top));
   const [width, height] = fullSize(), tangent = tangentOf(width, height), half = [tangent / height, tangent / height];
   const seen = { position: camera.position, rotation: rotationOf(camera), center: planeOf(left, top), half };
   return state.renderer.measure(seen, blendWeights(seen));
+}
+
+// The same in a room without Gaussians, by the walls of the doll's house.
+function measureRoom(node, ray) {
+  const house = findHouse(node);
+  if (!house) return null;
+  const [origin, end] = [camera.position, plus(camera.position, ray)].map((place) => placeInDoll(node, place, house).place);
+  return meetHouse(origin, minus(end, origin), house);
 }
 
 export function takePicture() {

@@ -16,7 +16,7 @@ export class Renderer {
     this.splat = this.link(SHADERS.splat);
     this.accumulate = this.link(SHADERS.accumulate);
     this.resolve = this.link(SHADERS.resolve);
-    const width = TEXTURE_WIDTH, height = Math.ceil(HEADER.count / width);
+    const width = TEXTURE_WIDTH, height = Math.max(Math.ceil(HEADER.count / width), 1);
     if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this device.");
     this.geometry = this.makeTexture(width, height, gl.RGBA32UI);
     this.scales = this.makeTexture(width, height, gl.R32UI);

@@ -1,13 +1,15 @@
-// The panoramas that can be visited: rings on the floor, the list, and the name of the one at the camera.
+// The panoramas that can be visited: rings in the picture, arrows at its border, the list, and the name of the one at the camera.
 
 import { nodeHere, tangentOf } from "./camera.js";
 import { chooseRings, isCovered } from "./choices.js";
-import { isInDoll } from "./doll.js";
+import { isInDoll, placeInDoll } from "./doll.js";
 import { byId, canvas, make } from "./dom.js";
 import { goTo } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus } from "./graph.js";
 import { camera, state } from "./state.js";
 
+const ARROW = 44, BORDER = 8;                   // pixels: size of an arrow, and to the border
+const MAX_ARROWS = 3;                           // at a side of the picture
 let rings = [], chosenFor = null, chosen = [];  // for a panorama
 
 export function makeRings() {
@@ -15,12 +17,14 @@ export function makeRings() {
   const marks = [...HEADER.spots.map((_, node) => ({ node, link: null })), ...links.map((link) => ({ node: link.to, link }))];
   rings = marks.map(({ node, link }) => {
     const { name, position, mark } = HEADER.spots[node], text = make("small", "");
-    const label = make("span", "", make("b", "", name), text), button = make("button", link && link.leave ? "fade" : "", label);
+    const label = make("span", "", make("b", "", name), text), button = make("button", "", label);
     const place = link ? { mark: link.mark, camera: null, radius: HEADER.spots[link.from].radius } : { mark, camera: position, radius: HEADER.spots[node].radius };
+    const heightOf = (point) => dot(column(HEADER.level, 1), point);
+    const isUpright = link !== null && heightOf(link.mark) < heightOf(HEADER.spots[link.from].mark) - 0.5 * place.radius;
     button.hidden = true;
     button.onclick = () => goTo(node);
     byId("spots").append(button);
-    return { node, link, button, label, text, ...place, size: null };
+    return { node, link, button, label, text, ...place, isUpright, size: null };
   });
 }
 
@@ -46,33 +50,63 @@ export function findRings() {
   return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= 2 * ring.radius);
 }
 
-// Rings in perspective, but not under the buttons. A label that would cover these or the label of a nearer ring is not shown.
+// Rings in perspective, and arrows at the border to those that are outside or under a control; none while the camera flies. A
+// label that would cover a control or the label of a nearer ring is not shown.
 export function placeRings(rotation) {
-  const found = findRings();
+  const found = state.flight?.legs[0].path ? [] : findRings();
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
-  const bars = ["buttons", "place"].map((id) => byId(id).getBoundingClientRect()).map((bar) => [bar.left, bar.top, bar.right, bar.bottom]);
-  const taken = [...bars], placed = [];
-  for (const ring of rings) {
-    const { radius } = ring, offset = minus(ring.mark, camera.position);
-    const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-    ring.button.hidden = !found.includes(ring) || z < 0.1 * radius;
-    if (!ring.button.hidden) placed.push({ ring, x, y, z, distance: Math.hypot(x, y, z) });
+  const bars = ["buttons", "place", "plan"].map((id) => byId(id).getBoundingClientRect()).map((bar) => [bar.left, bar.top, bar.right, bar.bottom]);
+  const taken = [...bars], sides = { left: 0, right: 0, up: 0, down: 0 };
+  rings.forEach(({ button }) => { button.hidden = true; });
+  const placed = found.map((ring) => {
+    const isMoved = state.doll.isOn && isInDoll(ring.node), mark = isMoved ? placeInDoll(ring.node, ring.mark).place : ring.mark;
+    const offset = minus(mark, camera.position), [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
+    return { ring, offset, distance: Math.hypot(...offset), place: findPlace(ring, [x, y, z], focal, bars) };
+  });
+  for (const { ring, offset, place } of placed.sort((a, b) => !a.place - !b.place || a.distance - b.distance)) {
+    const { button, label } = ring, { style } = button, box = place || findBorder(offset, focal, sides, taken);
+    if (!box) continue;
+    const [left, top, right, bottom] = box;
+    button.hidden = false;
+    button.className = place ? "" : `arrow ${box.side}`;
+    Object.assign(style, { width: `${right - left}px`, height: `${bottom - top}px`, transform: `translate(${left}px, ${top}px)` });
+    style.borderWidth = place ? `${clamp(0.09 * (right - left), 2, 6)}px` : "";
+    ring.size ||= [label.offsetWidth, label.offsetHeight];
+    const [wide, tall] = ring.size, middle = [0.5 * (left + right - wide), 0.5 * (top + bottom - tall)];
+    const [x0, y0] = { left: [right, middle[1]], right: [left - wide, middle[1]], down: [middle[0], top - tall] }[box.side] || [middle[0], bottom];
+    const labelBox = [x0, y0, x0 + wide, y0 + tall], isFree = taken.every((other) => !isCovered(labelBox, other));
+    label.style.visibility = isFree ? "" : "hidden";
+    if (isFree) taken.push(labelBox);
+    if (!place) taken.push(box);
   }
-  for (const { ring, x, y, z, distance } of placed.sort((a, b) => a.distance - b.distance)) {
-    const { style } = ring.button, size = clamp(2 * ring.radius * focal / z, 16, 128), tall = size * clamp(y / distance, 0.25, 1);
-    const [left, top] = [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
-    ring.button.hidden = bars.some((bar) => isCovered([left - 0.5 * size, top - 0.5 * tall, left + 0.5 * size, top + 0.5 * tall], bar));
-    if (ring.button.hidden) continue;
-    style.width = `${size}px`;
-    style.height = `${tall}px`;
-    style.borderWidth = `${clamp(0.09 * size, 2, 6)}px`;
-    style.transform = `translate(${left - 0.5 * size}px, ${top - 0.5 * tall}px)`;
-    if (!ring.size) ring.size = [ring.label.offsetWidth, ring.label.offsetHeight];
-    const box = [left - 0.5 * ring.size[0], top + 0.5 * tall, left + 0.5 * ring.size[0], top + 0.5 * tall + ring.size[1]];
-    const isFree = taken.every((other) => !isCovered(box, other));
-    ring.label.style.visibility = isFree ? "" : "hidden";
-    if (isFree) taken.push(box);
-  }
+}
+
+// The box of a ring in the picture; null for one outside or under a control. On the floor it is seen from above.
+function findPlace({ radius, isUpright }, [x, y, z], focal, bars) {
+  const { clientWidth: width, clientHeight: height } = canvas, [left, top] = [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
+  const size = clamp(2 * radius * focal / z, 16, 128), tall = isUpright ? size : size * clamp(y / Math.hypot(x, y, z), 0.25, 1);
+  const box = [left - 0.5 * size, top - 0.5 * tall, left + 0.5 * size, top + 0.5 * tall];
+  return z > 0.1 * radius && left > 0 && left < width && top > 0 && top < height && !bars.some((bar) => isCovered(box, bar)) ? box : null;
+}
+
+// The box of an arrow to where the camera turns towards an offset, and its `side`; null where the side is full.
+function findBorder(offset, focal, sides, taken) {
+  const { clientWidth: width, clientHeight: height } = canvas, [right, down, forward] = [0, 1, 2].map((k) => dot(column(HEADER.level, k), offset));
+  const across = Math.atan2(right, forward) - camera.yaw, around = Math.atan2(Math.sin(across), Math.cos(across));
+  const above = -Math.atan2(down, Math.hypot(right, forward)) - camera.pitch, isBeside = Math.abs(around) > Math.atan(0.5 * width / focal);
+  const side = state.doll.isOn ? null : isBeside ? around < 0 ? "left" : "right" : above > 0 ? "up" : "down";
+  if (side === null || sides[side] === MAX_ARROWS) return null;
+  const most = [width, height].map((length) => length - ARROW - BORDER), half = 0.5 * ARROW, [x, y] = [around, -above].map((angle) => focal * Math.tan(clamp(angle, -1.5, 1.5)));
+  const at = [0.5 * width + x - half, 0.5 * height + y - half];
+  const inward = { left: [1, 0], right: [-1, 0], up: [0, 1], down: [0, -1] }[side], steps = [...Array(40).keys()].map((k) => (k % 2 ? 1 : -1) * half * Math.ceil(k / 2));
+  const boxes = [0, 1, 2].flatMap((row) => steps.map((step) => {  // beside the place, else above what is there
+    const [left, top] = at.map((value, k) => clamp(value + step * !inward[k], BORDER, most[k]) + row * (ARROW + BORDER) * inward[k]);
+    return [left, top, left + ARROW, top + ARROW];
+  }));
+  const box = boxes.find((each) => taken.every((other) => !isCovered(each, other)));
+  if (!box) return null;
+  sides[side] += 1;
+  return Object.assign(box, { side });
 }
 
 const listed = [];  // a button for each panorama

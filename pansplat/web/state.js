@@ -21,8 +21,8 @@ export const state = {
   sorted: null, isSorting: false,                              // the last order of the worker (sorter.js)
   renderer: null,                                              // null while the graphics are lost
   isDirty: true, drawnScale: 0, lastChange: 0,                 // of the picture
-  flight: null, route: null, isTouring: false, still: null,    // flight.js
-  doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0 },
+  flight: null, isTouring: false, still: null,                 // flight.js
+  doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: 0 },
   headset: { session: null, turnTo() {} },                     // xr.js
   here: null,                                                  // the panorama at the camera of the last frame
   step: [0, 0, 0], isFast: false,                              // of the keys that are held: right, up, forward

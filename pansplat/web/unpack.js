@@ -47,7 +47,8 @@ async function readView(view, reader) {
   const arrays = unpack(planes, view);
   arrived.push(view);
   postMessage({ view, ...arrays }, Object.values(arrays).map((array) => array.buffer));
-  const isPart = scene.parts[view] === first?.part && scene.views[view].count, isLast = arrived.length === scene.loading.length;
+  const isOwn = (each) => scene.parts[each] === first?.part, isEmpty = (each) => !scene.views[each].count;
+  const isPart = isOwn(view) && (!isEmpty(view) || scene.loading.filter(isOwn).every(isEmpty)), isLast = arrived.length === scene.loading.length;
   if (!first || !isPart && !isLast) return;
   sort(first);
   first = null;

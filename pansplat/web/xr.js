@@ -10,6 +10,7 @@ import { coverage, goHome, goTo, isFlying, jumpTo, setTouring } from "./flight.j
 import { clamp, column, cross, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
 import { requestSort } from "./loading.js";
 import { advance, SORT_DISTANCE } from "./loop.js";
+import { photographs } from "./photographs.js";
 import { findRings } from "./rings.js";
 import { camera, changed, state } from "./state.js";
 
@@ -141,6 +142,7 @@ class Headset {
       if (!width || !height) continue;
       const eye = this.makeEye(view);
       state.renderer.draw(eye, blendWeights(eye), layer.framebuffer, [x, y, width, height]);
+      photographs.draw(eye, width, height, layer.framebuffer, [x, y]);
       this.drawMarks(eye, [...marks, ...this.findVeils(eye)]);
     }
   }
@@ -308,9 +310,9 @@ class Headset {
       if (found) pointed.set(found.ring, found.distance);
     }
     for (const ring of findRings()) {
-      const color = ring.link ? [1, 0.8, 0.4, 1] : [1, 1, 1, 1], strength = pointed.has(ring) ? 1 : 0.6;
-      const axes = [right, ahead].map((axis) => scaled(axis, ring.radius));
-      marks.push({ center: ring.mark, axes, shape: RING, color: scaled(color, strength) });
+      const strength = pointed.has(ring) ? 1 : 0.6, across = unit(cross(down, minus(ring.mark, camera.position)));
+      const axes = (ring.isUpright ? [across, down] : [right, ahead]).map((axis) => scaled(axis, ring.radius));
+      marks.push({ center: ring.mark, axes, shape: RING, color: Array(4).fill(strength) });
     }
     const [ring] = pointed.keys();
     if (ring) {

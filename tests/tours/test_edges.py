@@ -8,8 +8,8 @@ import torch
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.tours.edges import find_poor_edges, find_walls, judge_edges, measure_way
-from pansplat.tours.surfaces import locate_surfaces
+from pansplat.tours.edges import find_poor_edges, find_walls, judge_edges, measure_doubled
+from pansplat.tours.surfaces import find_colors, locate_surfaces
 
 
 @pytest.fixture(scope="module")
@@ -26,22 +26,37 @@ def bend(room: Scene, factor: float) -> Scene:
     return dataclasses.replace(room, gaussians=dataclasses.replace(gaussians, means=means))
 
 
-def measure(scene: Scene) -> tuple[float, float]:
-    first, second = (locate_surfaces(scene, view, np.eye(3), min_opacity=0.5) for view in (0, 1))
-    return measure_way(first, second, (scene.cam2world[1] - scene.cam2world[0])[:3, 3].numpy())
+def locate(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
+    places = locate_surfaces(scene, view, np.eye(3), min_opacity=0.5)
+    return places, find_colors(scene, view, min_opacity=0.5)
 
 
-def test_surfaces_of_one_room_agree_and_bent_ones_do_not(room: Scene) -> None:
-    agreeing, nearest = measure(room)
-    assert agreeing < 0.05 and nearest == 1
-    shares = [measure(bend(room, factor))[0] for factor in (1.05, 1.3)]
-    assert agreeing <= shares[0] < 0.5 < shares[1]
-    first, second = (locate_surfaces(room, view, np.eye(3), min_opacity=0.5) for view in (0, 1))
+def measure(scene: Scene) -> float:
+    return measure_doubled(locate(scene, 0), locate(scene, 1), (scene.cam2world[1] - scene.cam2world[0])[:3, 3].numpy())
+
+
+def test_surfaces_of_one_room_are_seen_once_and_bent_ones_twice(room: Scene) -> None:
+    agreeing = measure(room)
+    assert agreeing < 0.05
+    shares = [measure(bend(room, factor)) for factor in (1.05, 1.3)]
+    assert agreeing <= shares[0] < 0.5 * shares[1]
+    first, second = locate(room, 0), locate(room, 1)
     way = np.array((1.0, 0, 0))
-    assert measure_way(3 * first, 3 * second, 3 * way) == pytest.approx((agreeing, nearest), abs=0.02), "any unit"
-    close = np.concatenate([first, (0.5, 0, 0) + 0.1 * first / np.linalg.norm(first, axis=1)[:, None]])
-    assert measure_way(close, second, way)[1] == pytest.approx(0.1, abs=0.02)
-    assert measure_way(first[:0], second, way) == (1.0, 0.0)
+    larger = [(3 * places, colors) for places, colors in (first, second)]
+    assert measure_doubled(*larger, 3 * way) == pytest.approx(agreeing, abs=0.02), "any unit"
+    assert measure_doubled(second, first, -way) == pytest.approx(agreeing, abs=0.02), "either way"
+    plain = [(places, np.full_like(colors, 0.5)) for places, colors in (locate(bend(room, 1.3), n) for n in (0, 1))]
+    assert measure_doubled(*plain, way) == 0, "what has one colour is not seen twice"
+    assert measure_doubled((first[0][:0], first[1][:0]), second, way) == 1
+
+
+def test_only_the_directions_of_a_flight_count(room: Scene) -> None:
+    places, colors = locate(room, 1)
+    aside = np.abs(places[:, 0] + 0.5) < np.abs(places[:, 2])  # beyond 45 degrees of the way, from its middle
+    moved = np.where(aside[:, None], 3 * places, places)
+    assert measure_doubled(locate(room, 0), (moved, colors), np.array((1.0, 0, 0))) < 0.1
+    moved = np.where(aside[:, None], places, 3 * places)
+    assert measure_doubled(locate(room, 0), (moved, colors), np.array((1.0, 0, 0))) > 0.2
 
 
 def test_an_edge_is_poor_if_its_surfaces_disagree(room: Scene) -> None:

@@ -22,7 +22,8 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
 from pansplat.tours import plan as plan_module
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.plan import Plan, _Lines, _rays, _separate, _Sight, _trace_outline
+from pansplat.tours.plan import Plan, _Lines, _separate, _Sight, _trace_outline
+from pansplat.tours.surfaces import ray_directions
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -189,11 +190,11 @@ def test_the_plan_does_not_depend_on_the_unit_of_length() -> None:
 def test_a_corridor_whose_end_is_no_wall_ends_at_the_farthest_surface() -> None:
     right, ahead, left, behind = 1.6, 1.5, -2.0, -1.5
     lines = _Lines(np.array(((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0))), np.array((right, ahead, left, behind)))
-    reach = lines.offsets / (_rays() @ lines.normals.T)
+    reach = lines.offsets / (ray_directions() @ lines.normals.T)
     reach = np.where(reach > 0, reach, np.inf).min(axis=1)
     corridor = slice(11, 47)  # degrees: along the right wall, through the wall ahead
-    reach[corridor] = np.minimum(right / _rays()[corridor, 0], 4.3)
-    walls = reach[:, None] * _rays()
+    reach[corridor] = np.minimum(right / ray_directions()[corridor, 0], 4.3)
+    walls = reach[:, None] * ray_directions()
     outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
     assert outline is not None
     assert outline.bounds[:3] == pytest.approx((left, behind, right), abs=1e-6)
@@ -204,11 +205,11 @@ def test_a_room_stays_closed_where_no_wall_explains_what_is_seen_at_a_corner() -
     """Beyond the corner a sixth of the horizon looks into another room, which ends in a line with a wall ahead."""
     normals, offsets = ((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0)), (1.6, 1.24, -1.74, -1.6, 0.6)
     lines = _Lines(np.array(normals), np.array(offsets))
-    reach = lines.offsets / (_rays() @ lines.normals.T)
+    reach = lines.offsets / (ray_directions() @ lines.normals.T)
     reach = np.where(reach > 0, reach, np.inf)
     seen = reach[:, :4].min(axis=1)
     seen[230:282], seen[282:288] = 4.0, reach[282:288, 4]
-    walls = seen[:, None] * _rays()
+    walls = seen[:, None] * ray_directions()
     outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
     assert outline is not None
     assert outline.bounds == pytest.approx((-1.74, -1.6, 1.6, 1.24)) and outline.area == pytest.approx(3.34 * 2.84)
@@ -247,8 +248,20 @@ def test_each_camera_of_a_room_is_in_its_outline(monkeypatch: pytest.MonkeyPatch
     taken = shapely.box(-1, 4, 4, 7)
     monkeypatch.setattr(plan_module, "_separate", lambda shapes, _: [(n, shape - taken) for n, shape in shapes])
     plan = _plan(_make_house(WALLS, CAMERAS))
-    assert [room.panoramas for room in plan.rooms] == [(0,), (2,)]
-    assert any(line.startswith("no closed walls around panorama 2") for line in describe_plan(plan))
+    assert [room.panoramas for room in plan.rooms if room.is_closed] == [(0,), (2,)]
+    assert any(line.endswith("walls do not close around panorama 2") for line in describe_plan(plan))
+
+
+def test_a_room_whose_walls_do_not_close_is_a_rectangle_by_its_floor_beside_other_rooms() -> None:
+    """The last camera sees half of the walls below the ceiling."""
+    scene = _make_house(WALLS, CAMERAS)
+    means, is_last = scene.gaussians.means, scene.gaussians.views == 2
+    is_hidden = is_last & (means[:, 1] < -0.2) & (means[:, 0] < 7.5)
+    plan = _plan(dataclasses.replace(scene, gaussians=scene.gaussians.select(~is_hidden)))
+    assert [(room.panoramas, room.is_closed) for room in plan.rooms] == [((0, 1), True), ((2,), False)]
+    shape = shapely.Polygon(plan.rooms[1].outline)
+    assert shape.bounds == pytest.approx((5.0, 0.0, 9.0, 4.0), abs=0.2)
+    assert shape.intersection(shapely.Polygon(plan.rooms[0].outline)).area < 0.01
 
 
 def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
@@ -321,7 +334,7 @@ def test_texts_are_neither_on_walls_nor_on_dots_nor_on_one_another() -> None:
         approximate=((2, 0, 1.6, 0.4, 0.0),),
     )
     drawing = _Drawing(_plan(scene))
-    assert [room.panoramas for room in drawing.plan.rooms] == [(0, 1), (2,)]
+    assert [room.panoramas for room in drawing.plan.rooms] == [(0, 1), (3,), (2,)]
     walls = shapely.union_all([shapely.Polygon(drawing.outline(room)).exterior for room in drawing.plan.rooms])
     covers = []
     for text in drawing.list_texts():
@@ -388,7 +401,7 @@ def test_a_room_that_is_not_placed_is_upright_beside_the_others_and_no_camera_hi
 
 def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
     scene = _make_house(_walls_around(HALL), CAMERAS[2:])
-    few = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(20)))
+    few = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(5)))
     none = dataclasses.replace(few, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), overlaps=(), names=())
     for bad in (few, none):
         with pytest.raises(InputError, match="needed a floor, and walls around"):

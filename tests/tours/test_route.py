@@ -1,4 +1,4 @@
-"""Smooth flights through panoramas."""
+"""Ways through panoramas: turns, flights and zooms."""
 
 import dataclasses
 import itertools
@@ -11,43 +11,98 @@ import pytest
 import torch
 from PIL import Image
 
+from pansplat.geometry.path import turn_axes
 from pansplat.inputs.folders import load_pairs
 from pansplat.inputs.pairs import Panorama
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import TourGraph, find_tours
-from pansplat.tours.route import plan_route
+from pansplat.tours.route import Moment, Route, find_offset, plan_route
 
 
-def test_a_route_is_smooth_and_passes_the_panoramas(comb):
-    start = np.eye(4)
-    start[:3, 3] = 0.3, 0.0, -0.5
-    walk = comb.plan_walk(0)
-    route = plan_route(comb, walk, start)
-    assert np.allclose(route.pose(0), start)
-    assert np.allclose(route.pose(1)[:3, 3], comb.positions[walk[-1]])
-    poses = np.stack([route.pose(f) for f in np.linspace(0, 1, round(route.seconds * 30) + 1)])
-    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 1.05 / 30, "at most 1 m/s"
-    cosines = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
-    turns = np.degrees(np.arccos(np.clip((cosines - 1) / 2, -1, 1)))
-    assert turns.max() < 46 / 30, "at most 45 degrees per second"
-    distances = np.linalg.norm(poses[:, None, :3, 3] - comb.positions[None], axis=2).min(axis=0)
-    assert distances.max() < 0.2
-    assert np.allclose(poses[:, :3, 1], (0, 1, 0)), "level"
+def _start(tour: TourGraph, node: int, yaw: float = 0.0) -> np.ndarray:
+    """The pose of a camera at a panorama of a world with y down."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn_axes(np.eye(3), yaw, 0.0), tour.positions[node]
+    return pose
+
+
+def _watch(route: Route, rate: int = 60) -> list[Moment]:
+    """Moments of a route."""
+    count = round(route.seconds * rate)
+    return [route.at(k / count) for k in range(count + 1)]
+
+
+def _angle(first: np.ndarray, second: np.ndarray) -> float:
+    """Between the directions of two poses, degrees."""
+    return math.degrees(math.acos(min(max(float(first[:3, 2] @ second[:3, 2]), -1.0), 1.0)))
+
+
+def test_the_camera_turns_at_the_photograph_flies_ahead_and_arrives_at_the_photograph(comb):
+    route = plan_route(comb, [0, 1, 4], _start(comb, 0, math.pi / 2))
+    assert [step.kind for step in route.steps] == ["turn", "flight", "turn", "flight"]
+    assert [step.seconds for step in route.steps] == pytest.approx([0.4, 1.0, 0.4, 1.0])
+    moments = _watch(route)
+    for moment in moments:
+        step, place = moment.step, moment.pose[:3, 3]
+        ends = [comb.positions[node] for node in step.nodes]
+        if step.kind == "turn":
+            assert np.allclose(place, ends[0]) and (moment.photograph, moment.weight) == (step.nodes[0], 1)
+            continue
+        way = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        assert np.allclose(moment.pose[:3, 2], way), "ahead"
+        part = float((place - ends[0]) @ way)
+        assert np.allclose(place, ends[0] + part * way)
+        nearest = step.nodes[part > 0.499]
+        expected = 1 if min(part, 1 - part) < 0.1 else 0 if 0.2 < part < 0.8 else moment.weight
+        assert moment.photograph == nearest and moment.weight == pytest.approx(expected)
+        assert np.allclose(moment.pose[:3, 1], (0, 1, 0)), "level"
+    for before, after in itertools.pairwise(moments):
+        assert np.linalg.norm(after.pose[:3, 3] - before.pose[:3, 3]) < 1.51 / 60, "eased"
+        assert _angle(before.pose, after.pose) < 90 / 0.4 * 1.51 / 60 and abs(after.weight - before.weight) < 0.25
+    assert np.allclose(route.pose(1)[:3, 3], comb.positions[4]) and np.allclose(route.pose(1)[:3, 2], (1, 0, 0))
+
+
+def test_a_flight_takes_1_to_1_6_seconds_and_a_small_turn_less_than_a_large_one(make_tour):
+    tour = make_tour(((0, 0), (0, 0.3), (0, 4.3), (0, 20)), ((0, 1), (1, 2), (2, 3)))
+    route = plan_route(tour, [0, 1, 2, 3], _start(tour, 0, math.radians(9)))
+    assert [step.seconds for step in route.steps] == pytest.approx([0.2 * 0.4, 1.0, 1.2, 1.6])
+
+
+def test_a_route_ends_in_the_start_view_and_passes_those_on_the_way(comb):
+    panoramas = [dataclasses.replace(view, start=(-0.5, 0.2)) for view in comb.panoramas]
+    tour = dataclasses.replace(comb, panoramas=tuple(panoramas))
+    route = plan_route(tour, [0, 1, 2], _start(tour, 0))
+    assert [step.kind for step in route.steps] == ["flight", "flight", "turn"]
+    assert np.allclose(route.pose(1)[:3, 2], tour.find_start_view(2))
+    visits = plan_route(tour, [0, 1, 0, 4], rest=1.5)
+    assert [step.kind for step in visits.steps if step.kind != "turn"] == [
+        "rest",
+        "flight",
+        "rest",
+        "flight",
+        "flight",
+        "rest",
+    ]
+    assert list(visits.visits) == [0, 1, 4], "once"
+    for node, at in visits.visits.items():
+        moment = visits.at(at)
+        assert (moment.photograph, moment.weight) == (node, 1) and np.allclose(
+            moment.pose[:3, 2], tour.find_start_view(node)
+        )
 
 
 def test_a_route_reports_its_edges_in_order(comb):
     route = plan_route(comb, [4, 1, 2], comb.cam2world[0].numpy())
-    edges = [route.edge(f) for f in np.linspace(0, 1, 200)]
+    edges = [route.at(f).step.edge for f in np.linspace(0, 1, 200)]
     assert [key for key, _ in itertools.groupby(edges)] == [None, (1, 4), (1, 2)]
-    assert route.edges_after(0) == [(1, 4), (1, 2)] and route.edges_after(1) == [(1, 2)]
-    assert route.leg(0.0) == -1
+    assert list(dict.fromkeys(route.edges_after(0))) == [(1, 4), (1, 2)] and route.edges_after(1) == [(1, 2)]
+    assert [route.list_remaining(f) for f in (0.0, 0.55, 0.9, 1.0)] == [(4, 1, 2), (1, 2), (2,), (2,)]
 
 
 def test_a_route_to_the_panorama_at_the_camera_stays_there(comb):
     pose = comb.cam2world[2].numpy()
     route = plan_route(comb, [2], pose)
-    assert route.seconds < 3 and route.edge(0.5) is None
-    assert np.allclose(route.pose(0.5), pose)
+    assert 0 < route.seconds < 1 and np.allclose(route.pose(0.5), pose) and route.at(0.5).photograph == 2
 
 
 def test_a_route_to_the_only_panorama_of_its_walk_flies_there(comb):
@@ -57,6 +112,9 @@ def test_a_route_to_the_only_panorama_of_its_walk_flies_there(comb):
     route = plan_route(comb, walk, start)
     assert walk == [2] and route.walk == (2,), "an end of the edge at the camera"
     assert np.allclose(route.pose(0), start) and np.allclose(route.pose(1)[:3, 3], comb.positions[2])
+    assert route.at(0).weight == 0, "no photograph where there is no panorama"
+    way = plan_route(comb, [1], _start(comb, 0))
+    assert way.at(0).photograph == 0 and way.at(0).weight == 1 and way.edges_after(0) == [(0, 1)]
 
 
 def test_the_camera_looks_along_its_way_in_any_world(comb):
@@ -72,44 +130,56 @@ def test_the_camera_looks_along_its_way_in_any_world(comb):
     assert np.allclose(pose[:3, 1], (0, 0, -1))
 
 
-def test_a_route_goes_along_a_link_then_jumps_and_looks_away_from_the_link_back(home):
-    route = plan_route(home, [1, 2, 3, 6])
-    assert route.fades == (1, 2) and len(route.jumps) == 2
-    assert route.edges == ((1, 2), (3, 3), (6, 6))
-    before, after = route.jumps[0], route.jumps[0] + 1
-    assert np.allclose(route.positions[before], home.positions[2] + (-0.7, 0, 0)), "0.7 m to the left"
-    assert math.remainder(route.yaws[before] + math.pi / 2, 2 * math.pi) == pytest.approx(0, abs=0.02)
-    assert np.allclose(route.positions[after], home.positions[3]) and math.cos(route.yaws[after]) == pytest.approx(1)
-    assert route.legs[before] == 0 and set(route.legs[after : route.jumps[1] + 1]) == {1}
-    assert np.allclose(route.positions[route.jumps[1]], home.positions[3] + (0, 0, 0.7))
-    last = route.jumps[1] + 1
-    assert np.allclose(route.positions[last:], home.positions[6]) and math.cos(route.yaws[last]) == pytest.approx(1)
-    assert math.sin(route.yaws[-1]) == pytest.approx(1, abs=1e-3), "the last panorama, which is alone, is seen, too"
-    assert len(route.yaws) - last > 3 * 60, "for more than the second of the fade"
-    way = plan_route(home, [3, 6], home.cam2world[3].numpy())
-    assert math.cos(way.yaws[-1]) == pytest.approx(1), "a way to it ends in the direction of arrival"
-    steps = np.linalg.norm(np.diff(route.positions, axis=0), axis=1)
-    assert steps[np.delete(np.arange(len(steps)), route.jumps)].max() < 1.05 / 60, "only the jumps are fast"
-    count = 7 * len(route.yaws)
-    places = np.stack([route.pose(k / count)[:3, 3] for k in range(count + 1)])
-    assert np.linalg.norm(places[:, None] - home.positions[None], axis=2).min(axis=1).max() < 0.8, "never between parts"
-    seen = [route.edge(k / count) for k in range(count + 1)]
-    assert [edge for edge, _ in itertools.groupby(seen)] == [(1, 2), (3, 3), (6, 6)]
+def test_a_zoom_turns_to_the_link_grows_and_arrives_away_from_the_link_back(home):
+    route = plan_route(home, [2, 3], _start(home, 2))
+    assert [(step.kind, round(step.seconds, 3)) for step in route.steps] == [
+        ("turn", 0.4),
+        ("zoom", 0.7),
+        ("rest", 0.1),
+    ]
+    zoom = [moment for moment in _watch(route) if moment.arrival is not None]
+    link = turn_axes(np.eye(3), -math.pi / 2, -0.2)[:, 2]  # the ring is lower, 0.4
+    for moment in zoom:
+        assert np.allclose(moment.pose[:3, 3], home.positions[2]) and np.allclose(moment.pose[:3, 2], link)
+        assert moment.step.nodes == (2, 3) and moment.weight == 1, "no Gaussians"
+        assert np.allclose(moment.arrival[:3, 3], home.positions[3]) and np.allclose(moment.arrival[:3, 2], (0, 0, 1))
+    shares = [moment.arrived for moment in zoom]
+    assert shares[0] < 0.01 and shares[-1] > 0.99 and np.diff(shares).min() > 0 and np.diff(shares).max() < 2 / 42
+    assert [zoom[k].narrowing for k in (0, -1)] == pytest.approx([1, 2 / 3], abs=0.01)
+    assert np.allclose(route.pose(1), zoom[-1].arrival) and route.at(1).photograph == 3
+    assert [route.at(f).step.edge for f in (0, 0.9, 1)] == [(1, 2), (1, 2), (3, 3)]
+    onward = plan_route(home, [2, 3, 6, 4, 5], _start(home, 2))
+    assert list(dict.fromkeys(onward.edges_after(0))) == [(1, 2), (3, 3), (6, 6), (4, 5)]
 
 
-def test_a_fade_without_a_link_begins_at_once_and_ends_in_the_start_view_or_the_heading(home):
-    start = home.cam2world[3].numpy().copy()
-    start[:3, 3] += 0.3
-    start[:3, :3] = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))  # looks to the right
-    kept = plan_route(home, [3, 4, 5], start)
-    (jump,) = kept.jumps
-    assert np.allclose(kept.positions[: jump + 1], start[:3, 3]) and kept.legs[jump] == -1 and kept.edges[0] == (4, 5)
-    assert kept.yaws[jump + 1] == pytest.approx(math.pi / 2)
+def test_a_zoom_without_a_link_grows_where_the_camera_looks_and_arrives_in_the_start_view_or_a_wide_one(home):
+    start, wide = _start(home, 3, math.pi / 2), np.full(24, 3.0)
+    wide[2:5] = 8.0
+    route = plan_route(home, [3, 4], start)
+    assert route.steps[0].kind == "zoom"
+    assert np.allclose(route.pose(0), start) and np.allclose(route.pose(1)[:3, 2], start[:3, 2])
+    turned = plan_route(home, [3, 4], start, outlooks={4: wide})
+    assert math.atan2(*(turned.level.T @ turned.pose(1)[:3, 2])[::2]) == pytest.approx((3.5 / 24 - 0.5) * 2 * math.pi)
     panoramas = list(home.panoramas)
     panoramas[4] = dataclasses.replace(panoramas[4], start=(-0.5, 0.2))
     tour = dataclasses.replace(home, panoramas=tuple(panoramas))
-    route = plan_route(tour, [3, 4], start)
-    assert route.yaws[-1] == pytest.approx(-0.5) and route.pitches[-1] == pytest.approx(-0.2)
+    viewed = plan_route(tour, [3, 4], start, outlooks={4: wide})
+    assert np.allclose(viewed.pose(1)[:3, 2], tour.find_start_view(4))
+
+
+def test_along_a_poor_edge_the_camera_zooms_in_the_direction_of_the_other_panorama(comb):
+    poor = dataclasses.replace(comb, poor=((1, 4),))
+    route = plan_route(poor, [0, 1, 4], _start(poor, 0))
+    assert [step.kind for step in route.steps] == ["flight", "turn", "zoom", "rest"]
+    assert np.allclose(route.at(0.9).pose[:3, 2], (1, 0, 0)) and np.allclose(route.pose(1)[:3, 2], (1, 0, 0))
+
+
+def test_beside_its_panorama_a_photograph_is_seen_as_if_surfaces_were_2_5_metres_away():
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn_axes(np.eye(3), math.pi / 2, 0.0), (1, 2, 3)
+    assert np.allclose(find_offset(pose, np.array((1.5, 2, 3))), (0, 0, 0.2)), "in its axes: it looks to the right"
+    assert np.allclose(find_offset(pose, np.array((9, 2, 3))), (0, 0, 0.4)), "never near the surfaces"
+    assert not find_offset(pose, pose[:3, 3]).any()
 
 
 @pytest.mark.parametrize(("unit", "origin"), [(1e3, (0, 0, 0)), (1.0, (5e6, 4e5, 120)), (1e3, (5e9, 4e8, 1e5))])
@@ -121,7 +191,7 @@ def test_a_home_in_another_unit_or_far_from_the_origin_has_the_same_flight_and_g
     assert metres.plan_walk() == other.plan_walk() and list(metres.overlaps) == list(other.overlaps)
     assert assign_storeys(metres) == assign_storeys(other) == [0, 0, 0, 1, 1]
     ours, theirs = (plan_route(tour, tour.plan_walk()) for tour in (metres, other))
-    assert theirs.seconds == ours.seconds and 9 < ours.seconds < 60
+    assert theirs.seconds == pytest.approx(ours.seconds) and 4 < ours.seconds < 60
     edges = []
     for tour, route in ((metres, ours), (other, theirs)):
         edge, followed = (0, 1), []

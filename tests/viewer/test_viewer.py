@@ -313,7 +313,12 @@ def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
 
 
 def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_house, house):
-    gate = Gate(lambda _: [SceneEntry("placed", tour=house)], "pairs of panoramas", 0.3)
+    quarter = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))
+    views = [replace(view, cam2world=view.cam2world.clone()) for view in house.panoramas]
+    for view in views:
+        view.cam2world[:3] = torch.from_numpy(quarter) @ view.cam2world[:3]
+    turned = replace(house, panoramas=tuple(views))
+    gate = Gate(lambda _: [SceneEntry("placed", tour=turned)], "pairs of panoramas", 0.3)
 
     def find(path: Path, show: Callable[..., None]) -> object:
         show([SceneEntry("unplaced", tour=parted_house)])
@@ -326,9 +331,15 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
     assert app.scenes.names == ["unplaced"] and isinstance(app.content, int) and app.scenes.loaded is None
     app.until(lambda: app.scenes.loading == ("home", "pairs of panoramas", 0.3), "progress")
     assert app.scenes.loader.entry is None, "nothing is predicted from panoramas that may get poses"
+    app.state.target = 2
+    app.fly()
+    app.frame(drag=(120.0, 40.0))
+    seen = app.state.camera.rotation[:, 2]
     gate.open()
     app.settle()
-    assert app.scenes.names == ["placed"] and app.scenes.loaded.entry.tour is house
+    assert app.scenes.names == ["placed"] and app.scenes.loaded.entry.tour is turned
+    assert np.allclose(app.state.camera.position, turned.positions[2])
+    assert np.allclose(app.state.camera.rotation[:, 2], quarter @ seen), "the same place of the same photograph"
     gate.event.clear()
     shown = app.scenes.loaded
     app.scenes.search(Path("another"))
@@ -784,10 +795,12 @@ def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(m
     click_on(app, 3)
     app.until(lambda: app.scenes.tour.part == 1, "fade", 0.2)
     poses, front = stage.fade.poses, stage.fade.front
-    assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 0.71, "the scene before stays"
+    assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 1e-6, "the scene before stays"
     assert np.allclose(poses[front], app.state.camera.cam2world) and stage.slots[1 - front].scene is left
     app.fly(0.5)
     assert app.node == 3 and stage.slot.scene is not left
+    app.frame(0.5, held=frozenset("w"))
+    assert app.state.camera.position == tuple(parted_house.positions[3]), "one photograph is not walked in"
     app.state.target = 1
     app.fly(0.5)
     assert app.node == 1

@@ -193,10 +193,17 @@ def photographs(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> li
 
 
 @pytest.fixture(scope="module")
-def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: list[Pair]) -> Path:
+def folder(
+    scene: Scene,
+    house: Scene,
+    flat: Scene,
+    sites: Sites,
+    photographs: list[Pair],
+    take_photographs: Callable[..., list[Pair]],
+) -> Path:
     """tour.html, split.html with files, house.html with a graph, flat.html with parts.
 
-    photos.html and photos/index.html have photographs; poor/index.html has an edge along which the image fades.
+    photos.html, photos/index.html and rooms.html (as flat.html) have photographs; poor/index.html has a poor edge.
     """
     folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
@@ -207,6 +214,7 @@ def folder(scene: Scene, house: Scene, flat: Scene, sites: Sites, photographs: l
         write_page(scene, folder / "split.html", split=True)
         write_page(house, folder / "house.html")
         write_page(flat, folder / "flat.html")
+        write_page(flat, folder / "rooms.html", photographs=take_photographs(flat, 256))
         write_page(scene, folder / "photos.html", photographs=photographs)
         (folder / "photos").mkdir()
         write_page(scene, folder / "photos" / "index.html", photographs=photographs, split=True)
@@ -511,7 +519,6 @@ def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_ch
 def test_a_page_of_small_and_large_units_is_that_of_metres(
     chromium: Any, folder: Path, scene: Scene, photographs: list[Pair], tmp_path: Path
 ) -> None:
-    """The third panorama is moved to another storey."""
     seen, plans = [], []
     for unit in (1.0, 1e3, 1e-3):
         path = tmp_path / f"{unit:g}.html"
@@ -524,32 +531,100 @@ def test_a_page_of_small_and_large_units_is_that_of_metres(
                 page.run("(pose) => pansplat.setPose(pose)", pose)
                 page.settle()
                 seen.append(page.draw())
-            page.run("HEADER.spots[2].position[1] -= 3, 0")
             page.page.keyboard.press("KeyM")
             page.settle()
             plans.append(page.run("document.getElementById('drawing').innerHTML"))
     assert psnr(seen[0], seen[1]) < 25, "a photograph, and Gaussians"
-    assert "faint" in plans[0] and plans[0] == plans[1] == plans[2]
+    assert "svg" in plans[0] and plans[0] == plans[1] == plans[2]
     assert min(psnr(seen[k], seen[k % 2]) for k in range(2, 6)) > 45
 
 
-def test_flights_jumps_and_keys_end_alike_and_face_no_wall(chromium: Any, folder: Path) -> None:
-    """Where a panorama says that a camera turns from the directions of a heading, it does."""
-    with opened(chromium, folder / "tour.html") as page:
-        page.run("Object.assign(HEADER.spots[1], { turned: 1 << 13, ahead: [-2, 0.1] })")  # 15 to 30 degrees
-        ahead = math.degrees(-2)
-        for way, yaw, expected in (("key", 20, ahead), ("fly", 40, 40), ("jump", 20, ahead), ("jump", -20, -20)):
-            page.run("pansplat.goTo(1, { jump: true }).then(() => null)")
-            page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", yaw)
-            if way == "key":
-                page.page.keyboard.press("2")
-                page.wait("document.getElementById('name').textContent === 'room 1'")
+def test_flights_jumps_and_keys_end_alike(chromium: Any, folder: Path) -> None:
+    """In the start view of the panorama; without one in the direction of the way."""
+    with opened(chromium, folder / "tour.html", is_stepped=True) as page:
+        right, _, ahead = in_level(page, np.subtract(*page.run("[HEADER.spots[1].position, HEADER.spots[0].position]")))
+        for has_start, expected in ((False, (math.atan2(right, ahead), 0)), (True, (-2, 0.1))):
+            page.run(f"Object.assign(HEADER.spots[1], {{ ahead: [-2, 0.1], hasStart: {str(has_start).lower()} }})")
+            for way in ("goTo(2, { jump: true })", "goTo(2)", ""):
+                page.run("pansplat.setPose({ position: HEADER.spots[0].position, yaw: 20, pitch: 5 })")
                 page.settle()
-            else:
-                assert page.run("(jump) => pansplat.goTo(2, { jump })", way == "jump")
-            assert page.run("pansplat.getPose().yaw") == pytest.approx(expected, abs=1e-3), (way, yaw)
-            assert page.camera["pitch"] == pytest.approx(0.1 if expected == ahead else 0, abs=1e-3)
+                page.run(f"pansplat.{way}, 0") if way else page.page.keyboard.press("2")
+                page.settle()
+                assert page.camera["position"] == page.run("HEADER.spots[1].position")
+                assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx(expected, abs=1e-3), way
         assert page.messages == []
+
+
+def test_a_flight_looks_ahead_between_the_photographs_of_its_ends(chromium: Any, folder: Path) -> None:
+    count = """drawn = 0; (({ drawElementsInstanced }) => {
+        WebGL2RenderingContext.prototype.drawElementsInstanced = function (...values) {
+            drawn += 1;
+            drawElementsInstanced.apply(this, values);
+        };
+    })(WebGL2RenderingContext.prototype);"""
+    with opened(chromium, folder / "poor" / "index.html", script=count, is_stepped=True) as page:
+        start, end = (np.array(page.run(f"HEADER.spots[{node}].position")) for node in (1, 2))
+        right, _, ahead = in_level(page, end - start)
+        page.run("pansplat.goTo(3, { jump: true }), 0")  # so that its photograph is there
+        page.settle()
+        page.run(
+            "pansplat.setPose({ position: HEADER.spots[1].position, yaw: 90 - 180 * Math.sign(pansplat.camera.yaw) })"
+        )
+        page.settle()
+        frames = []
+        page.run("pansplat.goTo(3), 0")
+        while not frames or frames[-1][0] < 1:
+            page.run("drawn = 0, step(20), 0")
+            camera = page.camera
+            part = np.linalg.norm(camera["position"] - start) / np.linalg.norm(end - start)
+            frames.append((part, page.run("drawn") > 0, camera["yaw"]))
+        parts = np.array([part for part, *_ in frames])
+        shown = {bool(is_drawn) for part, is_drawn, _ in frames if part < 0.1 or part > 0.9}
+        assert shown == {False} and all(is_drawn for part, is_drawn, _ in frames if 0.2 < part < 0.8)
+        assert 15 <= (parts == 0).sum() <= 23 and 45 <= (parts > 0).sum() <= 53, "a turn of 0.4 s, and a flight of one"
+        flown = [yaw for part, _, yaw in frames if part > 0]
+        assert np.cos(flown) == pytest.approx(math.cos(math.atan2(right, ahead))) and np.ptp(flown) < 1e-9
+
+
+def test_a_room_without_a_flight_shows_its_photograph_only(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "rooms.html", is_stepped=True) as page:
+        page.settle()
+        page.run("pansplat.goTo(3), 0")
+        page.wait("pansplat.isSettled() && pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
+        image, there = page.draw(), page.camera
+        assert image.min() > 0.1, "a photograph, and nothing black"
+        page.page.keyboard.down("KeyW")
+        page.run("step(90)")
+        page.page.keyboard.up("KeyW")
+        page.settle()
+        assert page.camera == there
+        page.run("pansplat.camera.position[0] += 0.3")  # as a headset leaves it
+        page.settle()
+        assert page.draw().min() > 0.1
+        page.run("pansplat.goTo(1), 0")
+        page.settle()
+        assert page.camera["position"] == page.run("HEADER.spots[0].position") and page.messages == []
+
+
+def test_what_is_outside_of_the_picture_is_an_arrow_that_leads_there(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "tour.html", size=(640, 480), is_stepped=True) as page:
+        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        place, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
+        right, _, ahead = in_level(page, np.subtract(mark, place))
+        yaw, found = math.degrees(math.atan2(right, ahead)), []
+        for turn, pitch in ((90, 0), (-90, 0), (0, 60), (0, -40)):
+            page.run("([yaw, pitch]) => pansplat.setPose({ yaw, pitch, fov: 75 })", [yaw + turn, pitch])
+            page.settle()
+            button = page.page.locator("#spots button[title='Go to room 1']")
+            box = button.bounding_box()
+            assert 0 <= box["x"] <= 640 - box["width"] and 0 <= box["y"] <= 480 - box["height"]
+            found.append(button.get_attribute("class"))
+        assert found == ["arrow left", "arrow right", "arrow down", ""]
+        page.run("(yaw) => pansplat.setPose({ yaw: yaw + 90, pitch: 0 })", yaw)
+        page.settle()
+        button.click()
+        page.settle()
+        assert page.camera["position"] == page.run("HEADER.spots[1].position")
 
 
 def test_rings_behind_furniture_are_hidden_but_the_nearest_one(chromium: Any, folder: Path) -> None:
@@ -572,10 +647,10 @@ def test_no_ring_is_under_the_buttons(chromium: Any, folder: Path) -> None:
     shown = """() => {
         const boxes = (of) => [...document.querySelectorAll(of)].map((each) => each.getBoundingClientRect());
         const [bar] = boxes("#buttons"), rings = boxes("#spots button:not([hidden])");
-        const names = [...document.querySelectorAll("#spots button:not([hidden])")].map((each) => each.textContent);
+        const room = document.querySelector("#spots button[title='Go to room 1']:not([hidden])");
         const isBeside = (ring) => ring.right < bar.left || ring.left > bar.right;
         const isUnder = (ring) => ring.bottom >= bar.top && ring.top <= bar.bottom && !isBeside(ring);
-        return [rings.some(isUnder), names.includes("room 1")];
+        return [rings.some(isUnder), room.className];
     }"""
     with opened(chromium, folder / "tour.html", size=(640, 240)) as page:
         page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
@@ -587,10 +662,10 @@ def test_no_ring_is_under_the_buttons(chromium: Any, folder: Path) -> None:
         for turn in (30, -45):
             page.run("([yaw, pitch]) => pansplat.setPose({ yaw, pitch, fov: 75 })", [yaw + turn, pitch])
             page.settle()
-            is_under, is_shown = page.run(shown)
+            is_under, kind = page.run(shown)
             assert not is_under, turn
-            found.append(is_shown)
-        assert found == [True, False], "it is shown left of the buttons"
+            found.append(kind)
+        assert found == ["", "arrow down"]
 
 
 def test_a_note_of_the_tour_is_a_marker_at_its_panorama_that_opens_plain_text(
@@ -658,7 +733,7 @@ def test_at_a_panorama_the_page_shows_its_photograph_and_gaussians_elsewhere(
                 image, camera = page.draw(), page.camera
                 seen = look_at_photograph(photographs[node], level, camera)
                 if is_photograph:
-                    assert psnr(image, seen) > 38
+                    assert psnr(image, seen) > (34 if offset else 38), "surfaces are 2.5 m away"
                     assert psnr(image[:, ::-1], seen) < 30 and psnr(image[::-1], seen) < 30
                 else:
                     assert psnr(image, draw_reference(scene, level, origin, camera)) > 40
@@ -727,14 +802,13 @@ def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
     shutil.copytree(folder / "poor", folder / case)
     with opened(chromium, folder / case / "index.html", is_stepped=True) as page:
         page.settle()
-        page.run("HEADER.spots.forEach((spot) => { spot.turned = 0; })")
         if case == "missing":
             (folder / case / "index_files" / f"{page.run('HEADER.photographs[1].name')}_0.jpg").unlink()
         else:
             page.run("createImageBitmap = () => new Promise(() => {}), 0")
         start, opacity = page.camera["position"], "Number(document.getElementById('still').style.opacity)"
         page.run("pansplat.goTo(2), 0")
-        page.wait(f"!pansplat.camera.position.every((x, i) => x === {start}[i])", 1)
+        page.wait(f"!pansplat.camera.position.every((x, i) => x === {start}[i])", 5)
         if case == "late":
             page.run("step(1990)")
             for _ in range(20):  # the Gaussians may arrive late, too
@@ -746,7 +820,7 @@ def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
             page.run("step(90)")
             page.page.keyboard.up("KeyW")
         page.wait(f"{opacity} < 1", 0.001)
-        page.run("step(500)")
+        page.run("step(700)")
         assert page.page.is_hidden("#still")
         before = page.camera["position"]
         page.page.keyboard.down("KeyS")
@@ -780,6 +854,7 @@ def test_a_folder_loads_the_tiles_that_are_needed_and_shows_them_again_after_los
 
         (first,) = list_loaded()
         image = page.draw()
+        page.run("pose = pansplat.getPose(), 0")
         page.run("pansplat.goTo(3, { jump: true })")
         page.settle()
         assert list_loaded() == sorted({first, 2})
@@ -787,7 +862,7 @@ def test_a_folder_loads_the_tiles_that_are_needed_and_shows_them_again_after_los
         page.settle()
         page.run(LOSE_AND_RESTORE)
         page.settle()
-        page.run("(node) => pansplat.goTo(node, { jump: true })", first + 1)
+        page.run("pansplat.setPose(pose)")
         page.settle()
         assert psnr(page.draw(), image) > 30
 
@@ -818,7 +893,6 @@ def test_the_scene_follows_the_mouse(home: OpenPage) -> None:
 
 @pytest.mark.slow
 def test_space_flies_through_all_panoramas_and_a_ring_to_one(home: OpenPage) -> None:
-    home.run("HEADER.speed *= 100")  # a flight takes at least 0.6 s
     home.run("""passed = new Set(); (function record() {
         const { position } = pansplat.camera;
         passed.add(HEADER.spots.findIndex((spot) => spot.position.every((x, i) => x === position[i])));
@@ -1000,7 +1074,7 @@ def test_the_photograph_is_shown_before_any_gaussians_arrive(
         page.run("pansplat.setPose({ yaw: 30, pitch: 10 })")
         page.wait("document.getElementById('cover').hidden")
         seen, end = look_at_photograph(photographs[node], level, page.camera), time.monotonic() + LIMIT
-        middle, shown = np.s_[60:170, 60:260], np.zeros_like(seen)  # without buttons
+        middle, shown = np.s_[60:110, 60:260], np.zeros_like(seen)  # without buttons and arrows
         while psnr(shown[middle], seen[middle]) <= 25:  # until the larger tiles have arrived
             assert time.monotonic() < end
             page.wait("true")
@@ -1159,7 +1233,6 @@ def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(chromium: Any
         page.page.keyboard.press("KeyR")
         assert page.camera == start
         # A flight to the last panorama passes the second one, also from a camera that has just left the shown edge.
-        page.run("HEADER.speed *= 100")
         page.run("(camera) => Object.assign(pansplat.camera, camera)", camera)
         page.draw()
         fly = """(start) => {
@@ -1182,7 +1255,7 @@ def test_a_tour_blends_the_views_of_the_edge_and_flies_along_edges(chromium: Any
             for a, b in ((spots[0], spots[1]), (spots[1], spots[2]))
         ]
         assert np.minimum(*offset).max() < 1e-6 and between[:, 1].min() < 0.3
-        # The route begins near the camera and turns it.
+        # The flight through all panoramas goes on from the camera.
         page.page.keyboard.press("Space")
         page.wait(f"Math.hypot(...pansplat.camera.position.map((x, i) => x - {spots[2].tolist()}[i])) > 0.1")
         page.wait(f"Math.abs(pansplat.camera.yaw - {start['yaw']}) > 0.1")
@@ -1231,7 +1304,7 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert math.cos(page.camera["yaw"] - back["yaw"]) == pytest.approx(-1), "away from the link back"
         first = next(k for k, frame in enumerate(frames) if frame["left"])
         old, left = frames[first - 1], [frame["left"] for frame in frames[first:]]
-        assert old["position"] == pytest.approx(to["leave"], abs=1e-6) and old["yaw"] == pytest.approx(to["yaw"])
+        assert old["position"] == start["position"] and (old["yaw"], old["pitch"]) == pytest.approx((to["yaw"], -0.2))
         assert left[0] == 1 and left == sorted(left, reverse=True) and any(0.3 < part < 0.7 for part in left)
         # The image that fades out is that of the last camera.
         frozen = decode(frames[first]["image"])
@@ -1247,9 +1320,10 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert page.camera["position"] == page.run("HEADER.spots[3].position")
         assert (page.camera["yaw"], page.camera["pitch"]) == pytest.approx((3.1, 0.2), abs=1e-5)
         assert page.run(shown) == []
-        # Directions of before say nothing in a world of its own: it shows its widest view.
-        page.run("Object.assign(HEADER.spots[3], { ahead: [2.2, 0], turned: 0 })")
-        for world, expected in ((2, 2.2), (0, 0.7)):
+        # The way to a world of its own has no direction: it shows its widest view.
+        page.run("Object.assign(HEADER.spots[3], { ahead: [2.2, 0], hasStart: false })")
+        right, _, ahead = in_level(page, np.subtract(*page.run("[3, 0].map((node) => HEADER.spots[node].position)")))
+        for world, expected in ((2, 2.2), (0, math.atan2(right, ahead))):
             page.run("(world) => { HEADER.plan.worlds[3] = world; }", world)
             page.run("pansplat.goTo(1, { jump: true }).then(() => pansplat.setPose({ yaw: 0.7 * 180 / Math.PI }))")
             assert page.run("pansplat.goTo(4, { jump: true })")
@@ -1274,7 +1348,7 @@ def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panor
     with opened(chromium, folder / "house.html", script=FRAMES) as page:
         page.settle()
         spots = page.run("HEADER.spots.map(({ position }) => position)")
-        page.run("HEADER.poor.push([0, 1]); HEADER.spots.forEach((spot) => { spot.turned = 0; }); passed = []")
+        page.run("HEADER.poor.push([0, 1]); passed = []")
         way = np.array(page.run("HEADER.level")).T @ (np.array(spots[1]) - spots[0])
         page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", math.degrees(math.atan2(way[0], way[2])))
         page.run("""scales = []; record(); (function follow() {
@@ -1288,14 +1362,16 @@ def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panor
         places = {tuple(np.round(frame["position"], 6) + 0.0) for frame in frames}
         assert places == {tuple(np.round(spot, 6) + 0.0) for spot in spots[:2]}, "no picture from between"
         left = [frame["left"] for frame in frames if 0 < frame["left"] < 1]
-        assert 3 <= len(left) <= 6 and left == sorted(left, reverse=True), "half a second, at 100 ms a frame"
-        assert 1.3 < max(scales) <= 1.4 and frames[-1]["yaw"] == pytest.approx(frames[0]["yaw"])
+        assert 5 <= len(left) <= 8 and left == sorted(left, reverse=True), "0.7 s, at 100 ms a frame"
+        assert 1.5 < max(scales) <= 1.65 and frames[-1]["yaw"] == pytest.approx(frames[0]["yaw"])
         assert page.run("pansplat.goTo(3)")
         between = page.run("(first) => passed.slice(first).map(({ position }) => position)", len(frames))
         assert len({tuple(place) for place in between}) > 5, "a good edge is flown"
-        page.run("scales = []; passed = []")
-        page.run("pansplat.goTo(2).then(() => pansplat.setPose({ yaw: pansplat.getPose().yaw + 90 }))")
-        assert page.run("pansplat.goTo(1)") and max(page.run("scales")) < 1.05, "it grows on the way ahead only"
+        page.run("passed = []")
+        assert page.run("pansplat.goTo(1)")
+        assert len({tuple(place) for place in page.run("passed.map(({ position }) => position)")}) > 5, (
+            "also before a zoom"
+        )
         assert page.messages == []
 
 
@@ -1304,15 +1380,14 @@ def test_a_fade_begins_with_the_picture_at_rest(chromium: Any, folder: Path) -> 
     width = "document.getElementById('view').width"
     with opened(chromium, folder / "house.html", is_stepped=True) as page:
         page.settle()
-        page.run("HEADER.poor.push([0, 1]), HEADER.spots.forEach((spot) => { spot.turned = 0; })")
-        for yaw in range(8):
-            page.run(f"pansplat.setPose({{ yaw: {yaw} }}), step(90)")
-        assert page.run(width) < 0.6 * SIZE[0]
-        page.settle()
+        way = in_level(page, np.subtract(*page.run("[1, 0].map((node) => HEADER.spots[node].position)")))
+        page.run("(yaw) => pansplat.setPose({ yaw, pitch: 0 })", math.degrees(math.atan2(way[0], way[2])))
         seen = page.draw()
         page.settle()
-        page.run(f"pansplat.goTo(2), step({FRAME_MS})")
-        assert page.page.is_visible("#still"), "no other picture before"
+        page.run("HEADER.poor.push([0, 1]), pansplat.setPose({ yaw: 0 }), pansplat.goTo(2), 0")
+        while page.page.is_hidden("#still"):
+            least = page.run(f"step(90), {width}")
+        assert least < SIZE[0]
         assert psnr(decode(page.run("document.getElementById('still').toDataURL()")), seen) > 45
 
 
@@ -1458,7 +1533,7 @@ def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, sites: Sites, 
 def test_a_script_moves_the_camera_and_hears_of_arrivals(chromium: Any, folder: Path) -> None:
     with opened(chromium, folder / "house.html") as page:
         assert page.run("pansplat.panoramas") == ["room 0", "room 1", "room 2"]
-        page.run("HEADER.speed *= 100; pansplat.addEventListener('arrive', ({ detail }) => { heard = detail; })")
+        page.run("pansplat.addEventListener('arrive', ({ detail }) => { heard = detail; })")
         assert page.run("pansplat.goTo('room 2')") is True
         assert page.run("heard") == {"panorama": 3, "name": "room 2"}
         assert page.run("pansplat.getPose()")["position"] == page.run("HEADER.spots[2].position")
@@ -1526,7 +1601,7 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
         page.settle()
         page.run("pansplat.setPose({ yaw: 45, pitch: -40 })")
         page.settle()
-        found = page.run("""Array.from(document.querySelectorAll("#spots button:not([hidden])"), (button) => {
+        found = page.run("""Array.from(document.querySelectorAll("#spots button:not([hidden], .arrow)"), (button) => {
             const { left, top, width, height } = button.getBoundingClientRect(), label = button.querySelector("span");
             const [x, y] = [left + width / 2, top + height / 2], { visibility } = getComputedStyle(label);
             const places = [[20, 0], [-20, 0], [0, 20], [0, -20]];
@@ -1535,6 +1610,13 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
         })""")
         assert all(ring["name"] in ("room 1", "room 2") for ring in found)
         assert min(ring["size"] for ring in found) < 40 and any(all(ring["hit"]) for ring in found)
+        page.run("pansplat.setPose({ yaw: 45, pitch: 30 })")
+        page.settle()
+        arrows = page.run("""Array.from(document.querySelectorAll("#spots .arrow:not([hidden])"), (button) => {
+            const { left, top } = button.getBoundingClientRect();
+            return document.elementFromPoint(left + 22, top + 22) === button;
+        })""")
+        assert len(arrows) == 2 and all(arrows), "over the row of buttons"
         right = page.run(
             "Array.from(document.querySelectorAll('#buttons > :not([hidden])'), (e) => e.getBoundingClientRect().left)"
         )
@@ -1547,6 +1629,10 @@ def test_rings_on_a_touch_screen_have_names_and_room_for_a_finger(chromium: Any,
         assert "fewer than half" in page.page.inner_text("#status")
         box = page.page.query_selector("#status").bounding_box()
         assert box["width"] > 0.8 * 390 and box["x"] >= 0 and box["x"] + box["width"] <= 390, "a message is wide"
+        page.page.click("#help")
+        assert "two fingers" in page.page.inner_text("#keys table") and "W A S D" not in page.page.inner_text(
+            "#keys table"
+        )
 
 
 @pytest.mark.slow
@@ -1602,95 +1688,35 @@ def test_distances_are_those_of_the_rasterisers_depth(home: OpenPage, scene: Sce
 
 
 @pytest.mark.slow
-def test_the_floor_plan_shows_the_camera_and_leads_to_panoramas(chromium: Any, folder: Path) -> None:
-    with opened(chromium, folder / "flat.html", size=(640, 480)) as page:
-        level = np.array(page.run("HEADER.level"))
-        positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
-        outline = (positions[0] + ((-15, -20), (25, -20), (25, 20), (-15, 20))).tolist()
-        room = {"name": "<i>salon and dining room", "nodes": [0], "outline": outline, "label": [*outline[3], 2]}
-        rooms = [room, {**room, "nodes": [2], "name": "other world"}]
-        page.run(f"HEADER.plan.turns.fill(0.3); HEADER.plan.rooms = {json.dumps(rooms)}")
-        page.run(f"HEADER.plan.doors = [{{ room: 0, ends: {outline[:2]} }}]")
+def test_the_floor_plan_is_a_drawing_with_the_camera_and_leads_to_panoramas(chromium: Any, folder: Path) -> None:
+    with opened(chromium, folder / "flat.html", size=(800, 480)) as page:
         page.page.keyboard.press("m")
         page.settle()
-        boxes = [each.bounding_box() for each in page.page.query_selector_all("#plan button")]
+        page.wait("document.querySelector('#drawing img').naturalWidth > 0")
+        drawing, plan = page.page.query_selector("#drawing").bounding_box(), page.run("HEADER.plan")
+        assert drawing["x"] + drawing["width"] <= 200, "a quarter of the width"
+        boxes = [each.bounding_box() for each in page.page.query_selector_all("#drawing button")]
         assert len(boxes) == 4 and min(box[side] for box in boxes for side in ("width", "height")) >= 43.99
-        centers = np.array([(box["x"] + 22, box["y"] + 22) for box in boxes[:2]])
-        turn = np.array(((math.cos(0.3), math.sin(0.3)), (-math.sin(0.3), math.cos(0.3)))) * (1, -1)  # down is positive
-        places = positions @ turn
-        scale = np.linalg.norm(centers[1] - centers[0]) / np.linalg.norm(places[1] - places[0])
-        assert centers[1] - centers[0] == pytest.approx(scale * (places[1] - places[0]), abs=0.6)
-        # Outlines of rooms are to the same scale, and those of other worlds are in no drawing but a list.
-        drawn = page.run(
-            "Array.from(document.querySelectorAll('#plan polygon'), (each) => each.getAttribute('points'))"
-        )
-        drawing = page.page.query_selector("#drawing").bounding_box()
-        assert len(drawn) == page.page.locator("#plan line").count() == 1
-        corners = np.array([float(number) for number in drawn[0].replace(",", " ").split()]).reshape(-1, 2)
-        expected = centers[0] + scale * (np.array(outline) @ turn - places[0])
-        assert corners == pytest.approx(expected - (drawing["x"], drawing["y"]), abs=0.6)
-        above, below = corners[:, 1].min(), drawing["height"] - corners[:, 1].max()
-        assert above == pytest.approx(below, abs=0.6) and above < 40, "it is as high as what it shows"
-        elsewhere = page.page.locator("#elsewhere button")
-        assert elsewhere.all_inner_texts() == ["</script><b>hall", "attic"]
-        assert page.page.inner_text("#elsewhere").startswith("Not on the plan")
-        names = page.page.locator("#plan svg text")
-        assert names.all_text_contents() == ["<i>salon and dining room", "room 1"]
-        for box in (name.bounding_box() for name in names.all()):  # the first is at the left border
-            assert all(
-                drawing[x] <= box[x] and box[x] + box[side] <= drawing[x] + drawing[side]
-                for x, side in (("x", "width"), ("y", "height"))
-            )
+        centers = np.array([(box["x"] + 22, box["y"] + 22) for box in boxes])
+        corner, scale = np.array((drawing["x"], drawing["y"])), drawing["width"] / plan["size"][0]
+        assert centers == pytest.approx(corner + scale * np.array([place[:2] for place in plan["places"]]), abs=0.6)
         assert page.run("document.querySelector('#drawing [aria-current]').ariaLabel") == "Go to room 0"
-        turned = "document.querySelector('#plan path').getAttribute('transform')"
-        page.run("pansplat.setPose({ yaw: 90 + HEADER.plan.turns[0] * 180 / Math.PI })")
-        page.wait(f"Math.abs({turned}.split('rotate(')[1].slice(0, -1) - 90) < 1e-3")
-        x, y = (float(value) for value in page.run(turned)[10:].split(")")[0].split())
-        assert (drawing["x"] + x, drawing["y"] + y) == pytest.approx(centers[0], abs=0.6)
-        page.run("HEADER.speed *= 100")
-        assert np.linalg.norm(centers[1] - centers[0]) < 20, "buttons of 44 pixels overlap"
-        for node in (1, 0):
+        turn, here = math.degrees(plan["places"][0][2]), "document.getElementById('here').style"
+        page.run("(yaw) => pansplat.setPose({ yaw })", 90 - turn)
+        page.wait(f"Math.abs(parseFloat({here}.rotate) - 90) < 1e-3")
+        place = np.array([float(page.run(f"parseFloat({here}.{side})")) for side in ("left", "top")]) / 100
+        assert corner + place * (drawing["width"], drawing["height"]) == pytest.approx(centers[0], abs=0.6)
+        position = np.array(page.run("HEADER.spots[0].position")) + 0.5 * np.array(page.run("HEADER.level"))[:, 0]
+        page.run("(position) => pansplat.setPose({ position })", position.tolist())
+        page.settle()
+        moved = np.array([float(page.run(f"parseFloat({here}.{side})")) for side in ("left", "top")]) / 100
+        expected = 0.5 * np.array((math.cos(math.radians(turn)), math.sin(math.radians(turn))))
+        assert (moved - place) * plan["size"] == pytest.approx(expected, abs=1e-3)
+        for node, name in ((1, "room 1"), (0, "room 0"), (3, "attic")):
             page.page.mouse.click(*centers[node])
-            page.wait(f"document.querySelector('#drawing [aria-current]').ariaLabel === 'Go to room {node}'")
-        elsewhere.nth(1).click()
-        page.wait("document.querySelector('#elsewhere [aria-current]')?.textContent === 'attic'")
-        assert page.run("document.querySelector('#plan path').getAttribute('visibility')") == "hidden"
-        assert page.run("document.querySelectorAll('#drawing button').length") == 2, "the drawing stays"
+            page.wait(f"document.querySelector('#drawing [aria-current]').ariaLabel === 'Go to {name}'")
         page.page.keyboard.press("m")
         assert page.page.is_hidden("#plan") and page.messages == []
-
-
-@pytest.mark.slow
-def test_a_room_at_an_approximate_place_is_dashed_on_the_plan_of_another_world(chromium: Any, folder: Path) -> None:
-    with opened(chromium, folder / "flat.html", size=(640, 480)) as page:
-        level = np.array(page.run("HEADER.level"))
-        positions = (np.array(page.run("HEADER.spots.map((spot) => spot.position)")) @ level)[:, [0, 2]]
-        offsets = np.array(((-1, -1), (2, -1), (2, 1), (-1, 1)))  # around the camera: to the right, ahead
-        room = {"name": "bath", "nodes": [2], "outline": (positions[2] + offsets).tolist(), "hasWalls": True}
-        room["label"] = [*room["outline"][0], 2]
-        place = positions[0] + (5, 0)
-        page.run(f"HEADER.plan.turns.fill(0); HEADER.plan.rooms = [{json.dumps(room)}]; HEADER.plan.doors = []")
-        page.run(f"HEADER.plan.drawn[2] = [0, {place[0]}, {place[1]}, Math.PI / 2]")
-        page.page.keyboard.press("m")
-        page.settle()
-        drawing = page.page.query_selector("#drawing").bounding_box()
-        boxes = [each.bounding_box() for each in page.page.query_selector_all("#drawing button")]
-        centers = np.array([(box["x"] + 22 - drawing["x"], box["y"] + 22 - drawing["y"]) for box in boxes])
-        assert len(boxes) == 3 and centers[2, 1] == pytest.approx(centers[0, 1], abs=0.6)
-        scale = (centers[2, 0] - centers[0, 0]) / 5
-        points = page.page.get_attribute("#plan polygon.about", "points").replace(",", " ").split()
-        turned = offsets[:, ::-1] * (
-            1,
-            1,
-        )  # a quarter to the right: what was ahead is on the right, and down is positive
-        assert np.array(points, float).reshape(-1, 2) == pytest.approx(centers[2] + scale * turned, abs=0.6)
-        assert page.page.inner_text("#elsewhere").startswith("Dashed: about here")
-        assert page.page.locator("#elsewhere button").all_inner_texts() == ["</script><b>hall", "attic"]
-        arrow = "document.querySelector('#plan path').getAttribute('transform').match(/-?\\d[-.e\\d]*/g).map(Number)"
-        page.run("pansplat.goTo(3, { jump: true })")
-        page.wait(f"document.querySelector('#elsewhere [aria-current]') && Math.abs({arrow}[0] - {centers[2, 0]}) < 1")
-        yaw = page.run("pansplat.getPose().yaw")
-        assert page.run(arrow)[2] % 360 == pytest.approx((yaw + 90) % 360, abs=0.1) and page.messages == []
 
 
 @pytest.mark.slow
@@ -1870,7 +1896,8 @@ def test_sticks_walk_and_turn_in_steps(chromium: Any, folder: Path, iwer: str) -
         page.run("device.controllers.left.updateAxes('thumbstick', 0, 0)")
         page.run("walked()")
         right, down, forward = in_level(page, np.subtract(page.camera["position"], start["position"]))
-        assert forward > 0.05 and abs(right) < 1e-6 and abs(down) < 1e-6
+        assert math.atan2(right, forward) == pytest.approx(start["yaw"]) and math.hypot(right, forward) > 0.05
+        assert abs(down) < 1e-6
         stopped = page.camera
         page.run("device.controllers.right.updateAxes('thumbstick', 1, 0)")
         page.run("walked().then(walked)")
@@ -1923,8 +1950,7 @@ def above(page: OpenPage, node: int) -> np.ndarray:
 @pytest.mark.slow
 def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: str) -> None:
     with in_headset(chromium, folder / "tour.html", iwer, POINT) as page:
-        page.run("HEADER.speed *= 100")  # a flight takes 0.6 s
-        fly = "step = 50; walked().then(walked).then(walked)"
+        fly = "step = 120; walked().then(walked).then(walked)"
         right = "device.controllers.right"
         page.run(f"{right}.connected = true")  # it points straight ahead, at no ring
         before = page.camera
@@ -1934,7 +1960,7 @@ def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: s
         page.run(f"pointAt({right}, 1)")
         rings = see(page, (0.1, 1.6, -0.2), 0.2, -0.7)
         assert (rings[:, :200].min(axis=2) > 0.98).sum() > 40, "the ring that is pointed at is white"
-        page.run(f"step = 1; {right}.updateButtonValue('trigger', 1)")  # a flight takes 600 frames
+        page.run(f"step = 1; {right}.updateButtonValue('trigger', 1)")  # a flight takes 1000 frames
         page.run("walked()")
         page.run(f"{right}.updateButtonValue('trigger', 0)")
         between = above(page, 1)
@@ -1946,7 +1972,8 @@ def test_controllers_and_hands_select_rings(chromium: Any, folder: Path, iwer: s
         page.run("walked()")
         page.run("setHead([0.3, 1.6, -0.2], 0.2, 0)")
         page.run(fly)
-        assert above(page, 0) == pytest.approx((0.2 * math.cos(0.2), -0.2 * math.sin(0.2)), abs=1e-5)
+        heading = before["yaw"] + 0.2
+        assert above(page, 0) == pytest.approx((0.2 * math.cos(heading), -0.2 * math.sin(heading)), abs=1e-5)
         page.run("setHead([0.1, 1.6, -0.2], 0.2, 0)")
         page.run("walked()")
         assert above(page, 0) == pytest.approx(0, abs=1e-5)
@@ -1981,6 +2008,15 @@ def test_a_link_to_another_part_fades_from_black(chromium: Any, folder: Path, iw
         back = page.run("HEADER.links[1]")
         assert math.cos(page.camera["yaw"] - back["yaw"]) == pytest.approx(-1), "away from the link back"
         assert page.run("document.getElementById('still').hidden")
+
+
+@pytest.mark.slow
+def test_both_eyes_see_the_photograph_where_there_are_no_gaussians(chromium: Any, folder: Path, iwer: str) -> None:
+    with in_headset(chromium, folder / "rooms.html", iwer) as page:
+        page.run("step = 30; pansplat.goTo(3, { jump: true }).then(() => 0)")
+        image = see(page, (0.3, 1.6, -0.2), 0.2, 0)
+        left, right = image[:, :200], image[:, 200:]
+        assert image[40:160, 40:160].min() > 0.1 and psnr(left[40:160, 60:160], right[40:160, 20:120]) > 35
 
 
 @pytest.mark.parametrize(("script", "height"), [("", 0.5), ("device.supportedFeatures.splice(2, 1);", 1.6)])

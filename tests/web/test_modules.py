@@ -21,7 +21,6 @@ from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 from pansplat.tours.layout import REACH
-from pansplat.tours.outlook import choose_arrival, find_turned
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
@@ -122,6 +121,7 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         {"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": "", "clearances": []}
         for place in positions
     ]
+    house = make_house([node for node, part in enumerate(parts) if part == 0])
     return {
         "spots": spots,
         "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
@@ -136,7 +136,7 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         "poor": [],
         "next": [],
         "tallest": 1.5,
-        "doll": [make_house([node for node, part in enumerate(parts) if part == 0])],
+        "doll": [house | {"moves": [(0.0, *positions[node]) for node in house["nodes"]]}],
     }
 
 
@@ -217,7 +217,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
 def choose_rings(node: str, folder: Path, *, links: Any = (), hidden: Any = (), rooms: Any = (), here: int = 0) -> list:
     """The rings of a panorama in a row of four, the last one in another part, with `{from, to, mark}` of links."""
     header = make_header(ROW, [(0, 1), (0, 2), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"links": list(links)}
-    header["plan"] = {"rooms": [{"nodes": nodes} for nodes in rooms]}
+    header["plan"] = {"rooms": list(rooms)}
     for number, spot in enumerate(header["spots"]):
         spot["hidden"] = list(hidden) if number == here else []
     found = run(node, folder, header, "(here) => chooseRings(here)", here)
@@ -245,60 +245,31 @@ def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
     assert linked == [(2, None), (0, None)], "that of a link comes before"
 
 
-def test_arrivals_follow_the_table_of_the_panorama_and_come_away_from_the_link_back(node: str, tmp_path: Path) -> None:
+def test_a_way_ends_in_the_start_view_or_straight_on_and_away_from_the_link_back(node: str, tmp_path: Path) -> None:
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
-    header |= {"links": [{"from": 3, "to": 2, "leave": [0, 0, 0], "yaw": 1.0}], "plan": {"worlds": [0, 0, 0, 1]}}
-    outlook = np.full(24, 3.0)
-    outlook[11:14] = 1.0
-    outlook[4] = 9.0
-    for spot, start in zip(header["spots"], (None, (0.4, 0.3), None, None), strict=True):
-        is_turned, ahead = find_turned(outlook, start)
-        spot |= {"turned": sum(1 << k for k in np.flatnonzero(is_turned).tolist()), "ahead": ahead}
-    yaws = np.linspace(-7, 7, 61)
+    header["plan"] = {"worlds": [0, 0, 0, 1]}
+    header["links"] = [{"from": 3, "to": 2, "yaw": 1.0, "pitch": -0.6}]
+    for number, spot in enumerate(header["spots"]):
+        spot |= {"ahead": [0.4, 0.3], "hasStart": number == 1}
+    headings = run(node, tmp_path, header, "() => [[0, 1], [1, 0], [3, 2], [0, 3]].map((way) => findHeading(...way))")
+    level = [{"yaw": 0, "pitch": 0}, {"yaw": math.pi, "pitch": 0}]
+    assert headings == [*level, {"yaw": 1.0, "pitch": -0.2}, None], "not down to the floor; of another world"
+    program = "(ways) => ways.map(([node, heading, from]) => Object.values(chooseArrival(node, heading, from)))"
+    way = {"yaw": 2.0, "pitch": 0.2}
     found = run(
-        node,
-        tmp_path,
-        header,
-        "(yaws) => [0, 1].map((node) => yaws.map((yaw) => Object.values(chooseArrival(node, { yaw, pitch: 0.2 }))))",
-        yaws.tolist(),
+        node, tmp_path, header, program, [[1, way], [0, way], [0, None], [3, way, 2], [1, way, 2], [2, None, 3]]
     )
-    for row, start in zip(found, (None, (0.4, 0.3)), strict=True):
-        wrapped = [choose_arrival(outlook, math.remainder(yaw, 2 * math.pi), 0.2, start) for yaw in yaws]
-        expected = [(yaw if end[1] == 0.2 else end[0], end[1]) for yaw, end in zip(yaws, wrapped, strict=True)]
-        np.testing.assert_allclose(row, expected)
-        assert len({end[1] for end in row}) == (2 if start is None else 1)
-    arrive = (
-        "(from) => [chooseArrival(3, { yaw: 0.5, pitch: 0.2 }, from), chooseArrival(0, { yaw: 2, pitch: 0.2 }, from)]"
-    )
-    away, kept = run(node, tmp_path, header, arrive, 2)
-    assert (away, kept) == ({"yaw": pytest.approx(1 + math.pi), "pitch": 0}, {"yaw": 2, "pitch": 0.2})
-    unknown, _ = run(node, tmp_path, header, arrive, 1)
-    assert unknown == {"yaw": pytest.approx(find_turned(outlook)[1][0]), "pitch": 0}, "of another world, without a link"
+    assert found == [[0.4, 0.3], [2, 0], [0.4, 0.3], [1 + math.pi, 0], [0.4, 0.3], [0.4, 0.3]]
 
 
-def test_names_of_a_plan_cover_neither_dots_nor_each_other(node: str, tmp_path: Path) -> None:
-    random = np.random.default_rng(3)
-    dots = random.uniform(20, 280, (9, 2))
-    names = [{"x": x, "y": y, "width": 60, "height": 13} for x, y in [*dots, *dots[:4], (-5, 150), (299, 150)]]
-    places = run(
-        node,
-        tmp_path,
-        make_header(ROW, [], [0] * 4),
-        "(...all) => placeNames(...all)",
-        names,
-        dots.tolist(),
-        [300, 300],
-    )
-    boxes = [(x - 30, y - 6.5, x + 30, y + 6.5) for x, y in filter(None, places)]
-    assert len(boxes) > 9 and all(box[0] >= 0 and box[2] <= 300 and box[1] >= 0 and box[3] <= 300 for box in boxes)
-    for number, (left, top, right, bottom) in enumerate(boxes):
-        assert not any(left - 5 < x < right + 5 and top - 5 < y < bottom + 5 for x, y in dots)
-        others = boxes[:number]
-        assert not any(left < box[2] and right > box[0] and top < box[3] and bottom > box[1] for box in others)
-    crowd = [[x, y] for x in range(0, 300, 10) for y in range(0, 300, 10)]
-    assert run(
-        node, tmp_path, make_header(ROW, [], [0] * 4), "(...all) => placeNames(...all)", names[:1], crowd, [300, 300]
-    ) == [None]
+def test_a_camera_stays_at_photographs_without_gaussians(node: str, tmp_path: Path) -> None:
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"limits": [0, 2]}
+    program = f"""() => {{
+        {SORTED}
+        walk(0.1, 0, 0.1);
+        return [camera.position, cameraFor({{ position: [0.3, 0, 1.2] }}).position, isFixed()];
+    }}"""
+    assert run(node, tmp_path, header, program) == [[0, 0, 0], [0, 0, 2], True], "a script places it at one, too"
 
 
 def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp_path: Path) -> None:
@@ -451,6 +422,19 @@ def test_the_dolls_house_stays_in_the_picture_when_it_is_turned(node: str, tmp_p
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
     distances, first, widths = run(node, tmp_path, header, program, (390, 844))
     assert max(widths) <= 1 and min(distances) == pytest.approx(first) and max(distances) > 1.3 * first
+
+
+def test_the_dolls_house_is_beside_an_open_floor_plan(node: str, tmp_path: Path) -> None:
+    program = """(size, covered) => {
+        state.doll.covered = covered;
+        Object.assign(camera, frameDoll(size));
+        const local = findHouse().corners.map((place) => minus(place, camera.position)).map((place) =>
+            [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), place)));
+        return local.map(([x, , z]) => 0.5 * size[0] + 0.5 * size[1] * x / z / tangentOf(...size, camera.fov));
+    }"""
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
+    covered, free = (run(node, tmp_path, header, program, (320, 720), width) for width in (80, 0))
+    assert min(covered) >= 80 and max(covered) <= 320 and min(free) < 80
 
 
 def test_a_ray_meets_the_nearest_front_of_the_dolls_house(node: str, tmp_path: Path) -> None:

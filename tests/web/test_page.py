@@ -1,5 +1,6 @@
 """The files of a page, without a browser."""
 
+import base64
 import dataclasses
 import gzip
 import json
@@ -10,7 +11,6 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes, urljoin, urlsplit
@@ -25,6 +25,7 @@ from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
 from pansplat.export.page import write_page
+from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -74,12 +75,18 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     header = read_header(tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     tour = make_graph(room)
-    (drawn,), (expected,) = header["plan"]["rooms"], TourFacts(room).plan.rooms
-    assert drawn["name"] == "west / east" and drawn["nodes"] == [0, 1] and header["plan"]["worlds"] == [0, 0]
+    found, (expected,) = header["plan"], TourFacts(room).plan.rooms
+    svg, size, marks = draw_page_plan(TourFacts(room).plan)
+    assert found["rooms"] == [[0, 1]] and found["worlds"] == [0, 0] and b"west / east" in svg
+    assert base64.b64decode(found["drawing"]) == svg and found["size"] == pytest.approx(size)
     turn = level[:, (0, 2)].T @ tour.level_axes[:, (0, 2)]  # they differ by a quarter turn
-    outline = np.array(drawn["outline"]) + level[:, (0, 2)].T @ middle
-    assert shapely.Polygon(outline).symmetric_difference(shapely.Polygon(expected.outline @ turn.T)).area < 0.05
-    assert shapely.Polygon(outline).contains(shapely.Point(np.array(drawn["label"][:2]) + level[:, (0, 2)].T @ middle))
+    quarter = math.atan2(*(tour.level_axes[:, (0, 2)].T @ level[:, 2]))
+    for place, (x, y, heading) in zip(found["places"], marks, strict=True):
+        assert place == pytest.approx((x, y, heading + quarter), abs=1e-5) and abs(quarter) > 1.5
+    c, s = math.cos(found["places"][0][2]), math.sin(found["places"][0][2])
+    step = (cameras[1, :3, 3] - cameras[0, :3, 3]).numpy() @ level[:, (0, 2)] @ ((c, -s), (s, c)) * (1, -1)
+    assert np.subtract(found["places"][1], found["places"][0])[:2] == pytest.approx(step, abs=1e-5)
+    outline = expected.outline @ turn.T
     (house,) = header["doll"]
     corners = np.array(house["corners"])
     top = corners[:, 3:].max(axis=1) > 1
@@ -128,23 +135,7 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
     assert (
         headers[1]["doll"] == [] and page.num_outside == 3 and 'id="atlas"' not in (tmp_path / "none.html").read_text()
     )
-    assert not any(room["hasWalls"] for room in headers[1]["plan"]["rooms"])
-    assert headers[1]["plan"]["worlds"] == [0, 0, 0]
-
-
-def test_every_panorama_stands_in_an_outline_of_its_storey(flat: Scene) -> None:
-    tour, facts = make_graph(flat), TourFacts(flat)
-    floors = page_module._outline_floors(facts, ())
-    assert [room.panoramas for room in floors] == [(0,), (1,), (2,), (3,)]
-    places = tour.positions @ tour.level_axes[:, (0, 2)]
-    assert all(shapely.Polygon(room.outline).contains(shapely.Point(places[room.panoramas[0]])) for room in floors)
-    around = dataclasses.replace(floors[0], outline=shapely.Point(places[0]).buffer(60).exterior.coords[:])
-    assert page_module._outline_floors(facts, [around]) == [], "all stand in it"
-    above = dataclasses.replace(around, storey=around.storey + 1)
-    assert len(page_module._outline_floors(facts, [above])) == 4
-    hidden = flat.gaussians.select(flat.gaussians.means[:, 1] < -2)  # no floor
-    (circle, *_) = page_module._outline_floors(TourFacts(dataclasses.replace(flat, gaussians=hidden)), ())
-    assert shapely.Polygon(circle.outline).area == pytest.approx(math.pi * 1.5**2, rel=0.1)
+    assert headers[1]["plan"]["worlds"] == [0, 0, 0] and len(headers[1]["plan"]["places"]) == 3
 
 
 def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
@@ -164,35 +155,30 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
 
 def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = write_page(house, tmp_path / "good.html")
-    assert (good.num_flights, good.fades) == (2, ()) and read_header(tmp_path / "good.html")["jumps"] == []
+    assert (good.num_flights, good.fades) == (2, ())
     monkeypatch.setattr(edges, "POOR", -9)
     poor = write_page(house, tmp_path / "poor.html")
     header = read_header(tmp_path / "poor.html")
     assert (poor.num_flights, len(poor.fades)) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
     assert poor.fades == tuple(zip(house.names[:2], house.names[1:], strict=True)), "the labels"
-    assert len(header["jumps"]) >= 3 and set(header["parts"]) == {0}, "the route fades from panorama to panorama"
+    assert set(header["parts"]) == {0} and header["walk"] == [0, 1, 2]
     joint = dataclasses.replace(house, joint=True, overlaps=())
     assert write_page(joint, tmp_path / "joint.html").fades == ()
 
 
-def test_the_page_of_a_tour_has_its_edges_and_its_route(house: Scene, tmp_path: Path) -> None:
+def test_the_page_of_a_tour_has_its_edges_and_its_walk(house: Scene, tmp_path: Path) -> None:
     write_page(dataclasses.replace(house, names=("hall", "hall", "bath")), tmp_path / "tour.html")
     header = read_header(tmp_path / "tour.html")
     assert [spot["name"] for spot in header["spots"]] == ["hall", "hall", "bath"], "rooms of poses.json"
     assert header["groups"] == [[0, 1], [1, 2]] and header["edges"] == [[0, 1, 0], [1, 2, 1]]
     assert header["next"] == [[0, 1, 1], [0, 1, 2], [1, 1, 2]]
-    positions, route = np.array([view["position"] for view in header["views"]]), np.array(header["route"])
-    distances = np.linalg.norm(route[:, None, :3] - positions, axis=2)
-    assert distances.min(axis=0).max() < 0.2, "it passes all panoramas"
-    assert distances[0, 0] < 1e-3 and distances[-1, 0] < 1e-3, "it ends where it begins"
-    assert np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1).max() < 1.05 / header["routeRate"], "1 m/s"
-    assert header["start"]["position"] == pytest.approx(route[0, :3], abs=1e-3)
+    assert header["walk"] == [0, 1, 2] and header["start"]["position"] == header["views"][0]["position"]
     assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"][0], abs=1e-3), (
         "not along the first flight"
     )
 
 
-def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scene, tmp_path: Path) -> None:
+def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> None:
     write_page(flat, tmp_path / "tour.html")
     header = read_header(tmp_path / "tour.html")
     assert header["parts"] == [0, 0, 1, 2] and header["edges"] == [[0, 1, 0], [2, 2, 1], [3, 3, 2]]
@@ -200,24 +186,31 @@ def test_the_page_of_a_tour_of_parts_has_links_and_a_route_that_jumps(flat: Scen
     start, spots, level = header["start"], header["spots"], np.array(header["level"])
     assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
-    assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[3]["turned"] == 2**24 - 1
-    assert spots[1]["turned"] < 2**24 - 1 and spots[1]["ahead"][1] == 0
+    assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[1]["ahead"][1] == 0
+    assert [spot["hasStart"] for spot in spots] == [True, False, False, True]
     np.testing.assert_allclose(spots[1]["clearances"], measure_clearance(flat, 1, level), atol=0.0051)
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
-    assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4)
+    assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4) and to["pitch"] == -0.6
     right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
     wall = measure_outlook(flat, 0, level)[find_bin(0.5 * math.pi)]
-    expected = min(max(down / np.tan(0.6), 1), 3, 0.8 * wall)
-    assert right == pytest.approx(expected, rel=0.01) and ahead == pytest.approx(0, abs=1e-5)
-    assert level.T @ np.subtract(to["leave"], spots[0]["position"]) == pytest.approx((0.7, 0, 0), abs=1e-5)
+    assert (right, ahead) == pytest.approx((max(down / np.tan(0.6), 1), 0), rel=0.01, abs=1e-5) and right < wall
     assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
-    route, jumps = np.array(header["route"]), header["jumps"]
-    distances = np.linalg.norm(route[:, None, :3] - [spot["position"] for spot in spots], axis=2)
-    assert distances.min(axis=0).max() < 0.2, "it passes all panoramas"
-    steps = np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1)
-    assert len(jumps) == 3 and steps[jumps].min() > 10 and np.delete(steps, jumps).max() < 1.05 / header["routeRate"]
+    assert sorted(header["walk"]) == [0, 1, 2, 3] and header["walk"][0] == 0
+
+
+def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(
+    flat: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]]
+) -> None:
+    photographs = take_photographs(flat, 64)
+    write_page(flat, tmp_path / "tour.html", photographs=photographs)
+    header = read_header(tmp_path / "tour.html")
+    assert [view["count"] > 0 for view in header["views"]] == [True, True, False, False]
+    assert header["limits"] == [pytest.approx(2.0), 0, 0] and header["loading"] == [0, 1, 2, 3]
+    alone = dataclasses.replace(flat, overlaps=tuple((node, node, 1.0) for node in range(4)))
+    written = write_page(alone, tmp_path / "alone.html", photographs=photographs)
+    assert written.num_gaussians == 0 and read_header(tmp_path / "alone.html")["limits"] == [0] * 4
 
 
 @pytest.mark.parametrize(("size", "limit"), [(1.0, 1.0), (0.5, 0.62)])
@@ -240,21 +233,24 @@ def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
     assert torch.equal(merged.cam2world, flat.cam2world)
 
 
-def test_gaussians_leave_bytes_to_photographs_that_need_them_more_where_no_camera_flies() -> None:
+def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
+    shares = [page_module._choose_share(count, [4096] * 5) for count in (0, 450_000)]
+    assert page_module._choose_share(450_000, [1024] * 5) == page_module._choose_share(450_000, []) == 1
+    assert shares[1] < 1
     edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
-    flights = page_module._Flights(torch.eye(4), np.eye(3), 0.0, 0.0, (0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges)
-    share = partial(page_module._share_gaussians, flights, [(2, 3)], 450_000)
-    assert set(share([1024] * 5).values()) == set(share([]).values()) == {1.0}, "all fit, and a folder has all"
-    shares = share([4096] * 5)
-    assert 0 < shares[1] == shares[2] < shares[0] < 1
+    flights = page_module._Flights(
+        torch.eye(4), np.eye(3), 0.0, 0.0, (0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), (), edges
+    )
+    assert page_module._find_flown_parts(flights, [(2, 3)]) == {0}
     alone = dataclasses.replace(flights, edges=(), parts=(0,) * 5)
-    assert page_module._share_gaussians(alone, (), 450_000, [4096] * 5) == {0: shares[0]}, "of a pair"
+    assert page_module._find_flown_parts(alone, ()) == {0}, "of a pair"
 
 
-def test_parts_keep_their_shares(flat: Scene) -> None:
-    merged = page_module._merge(flat, (0, 0, 1, 2), 800, shares={0: 1.0, 1: 0.25, 2: 0.25})
+def test_panoramas_without_gaussians_leave_them_to_others(flat: Scene) -> None:
+    without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
+    merged = page_module._merge(without, (0, 0, 1, 2), 600)
     counts = np.bincount(merged.gaussians.views.numpy())
-    assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 50
+    assert counts[0] + counts[1] == 400 and counts[2] == 0 and counts[3] == 200
 
 
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
@@ -11,6 +12,7 @@ from pansplat.system.progress import show_progress
 
 Result = TypeVar("Result")
 Report = Callable[..., None]  # description of the work, fraction done
+_LEAST_SECONDS, _LEAST_FRACTION = 2.0, 0.05  # of work, before which its remaining time is unknown
 
 
 class CancelledError(Exception):
@@ -27,6 +29,7 @@ class _Task(Generic[Result]):
 
     def __init__(self, executor: ThreadPoolExecutor, work: Callable[[Report], Result], description: str) -> None:
         self.description, self.fraction, self.is_cancelled = description, 0.0, False
+        self.started = time.monotonic()
         self.future: Future[Result] = executor.submit(copy_context().run, self._run, work)  # with its device
 
     def _run(self, work: Callable[[Report], Result]) -> Result:
@@ -68,6 +71,16 @@ class BackgroundWorker(Generic[Result]):
     def progress(self) -> tuple[str, float] | None:
         """Description and fraction done; None as for `future`."""
         return None if self._task is None else (self._task.description, self._task.fraction)
+
+    def describe_time(self) -> str:
+        """The remaining time of the work; the time that it has taken while that is unknown, and none without work."""
+        if self._task is None:
+            return ""
+        seconds, done = time.monotonic() - self._task.started, self._task.fraction
+        if seconds < _LEAST_SECONDS or done < _LEAST_FRACTION:
+            return f"{seconds:.0f} s"
+        left = seconds * (1 - done) / done
+        return f"about {left / 60:.0f} min left" if left > 90 else f"about {5 * round(left / 5) or 5} s left"
 
     def poll(self) -> Result | BaseException | None:
         """The result or the exception of work that is finished, once; None before."""

@@ -106,7 +106,12 @@ def find_entries(
     from pansplat.pipeline import load_pairs, load_predictor, warn_of_single_views
     from pansplat.tours.graph import find_tours
 
-    on_unposed, pairs = None if show is None else lambda pairs: show(_list_tours(pairs)), []
+    def on_unposed(pairs: "list[Pair]") -> None:
+        if show is not None:
+            show([SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)])
+        report_progress("finding where they were taken", 0.0)
+
+    pairs = []
     with collect_notes() as notes:
         try:
             pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
@@ -125,12 +130,6 @@ def find_entries(
     entries = [SceneEntry(tour.name, tour=tour, notes=tuple(notes)) for tour in tours]
     entries += [SceneEntry(pair.name, pair=pair, notes=tuple(notes)) for pair in pairs]
     return entries + [SceneEntry(p.stem, file=p, notes=tuple(notes)) for p in scenes]
-
-
-def _list_tours(pairs: "list[Pair]") -> list[SceneEntry]:
-    from pansplat.tours.graph import find_tours
-
-    return [SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)]
 
 
 def choose_entry(entries: Sequence[SceneEntry], name: str | None) -> int:
@@ -324,6 +323,10 @@ class SceneLoader:
         if self._request is None or self._request.is_shown or self._loading.progress is None:
             return None
         return self._request.entry.name, *self._loading.progress
+
+    def describe_time(self) -> str:
+        """The remaining time of what `progress` is of, or the time that it has taken."""
+        return (self._searching if self.is_searching else self._loading).describe_time()
 
     @property
     def refinement(self) -> float | None:

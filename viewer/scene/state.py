@@ -17,7 +17,7 @@ from pansplat.geometry.path import (
 )
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.route import NEAR_OF_FAR, Route
+from pansplat.tours.route import NEAR_OF_FAR, Moment, Route
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.picking import PickedPoint
 from pansplat_viewer.scene.settings import Display, DrawSettings
@@ -69,6 +69,11 @@ class ViewerState:
     message: str = ""  # a text to show until `message_until`
     message_until: float = 0.0
     quit: bool = False  # whether to close the viewer
+
+    @property
+    def moment(self) -> Moment | None:
+        """Of the route through a tour, while the camera follows it."""
+        return self.route.at(self.flight) if self.route is not None and self.playing else None
 
     @property
     def draw_settings(self) -> DrawSettings:
@@ -147,11 +152,17 @@ def fit_settings(settings: DrawSettings, scene: Scene) -> DrawSettings:
 
 
 def limit_camera(state: ViewerState, before: Camera) -> None:
-    """Stop a camera that walks before surfaces, and say once why."""
+    """Stop a camera before surfaces, and say once why.
+
+    At a panorama of a tour that no edge leads to, it stays where it is.
+    """
     bounds, camera = state.tour or state.bounds, state.camera
     if bounds is None or state.orbiting or camera.position == before.position:
         return
-    place = bounds.limit_step(np.array(before.position), np.array(camera.position))
+    place = np.array(before.position)
+    first, last = bounds.find_nearest_edge(place)[0]
+    if first != last or state.tour is None:
+        place = bounds.limit_step(place, np.array(camera.position))
     state.camera = replace(camera, position=tuple(place.tolist()))
     if state.tour is None and not state.has_stopped and not np.allclose(place, camera.position):
         state.has_stopped = True

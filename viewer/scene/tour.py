@@ -18,14 +18,12 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
 from pansplat.tours.links import link_parts
-from pansplat.tours.outlook import BINS
-from pansplat.tours.route import FADE_SECONDS, STOP_SECONDS, Route, plan_route
+from pansplat.tours.route import REST_SECONDS, STOP_SECONDS, Moment, Route, plan_route
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 
 _MEMORY = 2 << 30  # bytes of the scenes of a tour that are kept; two predictions are kept in any case
 _LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
-_FIRST_STOP_WEIGHT = 0.01  # of a photograph after a cut
 _NEXT_SCENES = 3  # that are dropped last
 
 
@@ -217,7 +215,7 @@ class TourScenes:
 
     def move(self, position: Float[np.ndarray, "3"], edge: Edge | None = None) -> None:
         """Choose an edge that is flown, or that of a camera position."""
-        if edge is None:
+        if edge is None or edge not in self._views:  # a wall was found while it was flown along
             tour, known = self.tour, self._is_edge_known
             edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
         self.edge, self._is_edge_known = edge, True
@@ -238,7 +236,9 @@ class TourScenes:
         These are the next ones of a route; then those around the nearest panorama, those of its part by distance, and
         those of other parts: first where links lead to, then in the order of the panoramas.
         """
-        ahead = [] if route is None else [self._views[edge] for edge in route.edges_after(fraction)]
+        ahead = (
+            [] if route is None else [self._views[edge] for edge in route.edges_after(fraction) if edge in self._views]
+        )
         if self._following is None or self._following[0] != self.edge:
             self._following = self.edge, self._list_following()
         scenes = [self.views, *ahead, *self._following[1]]
@@ -284,18 +284,16 @@ class TourScenes:
         if remaining:
             walk = self._find_way(position, remaining[0])
             for a, b in itertools.pairwise(remaining):
-                is_step = (min(a, b), max(a, b)) in self.tour.overlaps or self.tour.is_fade(a, b)
-                walk += [b] if is_step else self.tour.find_walk(a, b)[1:]
+                walk += self.tour.find_walk(a, b)[1:]
         else:
             edge, _ = self.tour.find_nearest_edge(position, self._find_part(position))
             distances = np.linalg.norm(self.tour.positions[list(edge)] - position, axis=1)
             walk = self.tour.plan_walk(edge[int(distances.argmin())])
-        return plan_route(self.tour, walk, camera)
+        return plan_route(self.tour, walk, camera, rest=REST_SECONDS, outlooks=self.outlooks)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
-        """A route from a pose to a panorama, which ends as `choose_arrival` states."""
-        outlook = self.outlooks.get(node, np.zeros(BINS))
-        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlook)
+        """A route from a pose to a panorama."""
+        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlooks=self.outlooks)
 
     def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
         return self.tour.find_way(position, node, self._find_part(position))
@@ -322,11 +320,9 @@ def measure_bytes(scene: Scene) -> int:
 class StopFade:
     """The photograph of the panorama at which the camera stands; it fades in and out for `STOP_SECONDS`.
 
-    After a cut from one panorama to another it fades from photograph to photograph for `FADE_SECONDS`.
-
     Attributes:
         index: number of the photograph; None if none is shown.
-        before: that of the panorama before the cut; None if the photograph fades from or to the scene.
+        before: of a zoom, the photograph that it begins with; else None.
         weight: of the photograph over that one or the scene, 0 to 1.
     """
 
@@ -337,19 +333,26 @@ class StopFade:
         self.weight = 0.0
         self._last = 0.0
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is seen of the scene."""
+        return self.weight >= 1 or self.before is not None
+
+    def follow(self, moment: Moment, now: float) -> None:
+        """Show what a route shows at time `now` (seconds)."""
+        self._last, self.before, self.index, self.weight = now, None, moment.photograph, moment.weight
+        if moment.arrival is not None:
+            self.before, self.index, self.weight = self.index, moment.step.nodes[1], moment.arrived
+
     def update(self, index: int | None, now: float, *, at_once: bool = False) -> None:
-        """Go on to time `now` (seconds), while the camera stands at a panorama, or at none.
+        """Go on to time `now`, while the camera stands at a panorama, or at none.
 
         With `at_once` its photograph is shown already and does not fade in.
         """
-        seconds = STOP_SECONDS if self.before is None else FADE_SECONDS
-        step = min(max(now - self._last, 0.0) / seconds, _LARGEST_STOP_STEP)
-        self._last = now
+        step = min(max(now - self._last, 0.0) / STOP_SECONDS, _LARGEST_STOP_STEP)
+        at_once = at_once or self.before is not None  # a zoom has shown it
+        self._last, self.before = now, None
         if self.weight <= 0 or at_once:
             self.index = index
-        elif index is not None and index != self.index:
-            self.before, self.index, self.weight, step = self.index, index, _FIRST_STOP_WEIGHT, 0.0
         is_here = index is not None and index == self.index
         self.weight = 1.0 if is_here and at_once else min(max(self.weight + (step if is_here else -step), 0.0), 1.0)
-        if not is_here or self.weight >= 1:
-            self.before = None

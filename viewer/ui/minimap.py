@@ -15,8 +15,9 @@ from imgui_bundle import imgui
 from jaxtyping import Float
 
 from pansplat.system.descriptions import describe_count
-from pansplat.tours.floor import find_other_storeys
-from pansplat.tours.graph import TourGraph
+from pansplat.tours.floor import choose_camera_height, find_other_storeys
+from pansplat.tours.graph import DrawnPlace, TourGraph
+from pansplat.tours.linked_rooms import place_rooms
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
@@ -72,14 +73,18 @@ class Minimap:
 
     def __init__(self) -> None:
         self.nodes: list[tuple[float, float]] = []
+        self._drawn: dict[int, DrawnPlace] = {}
+        self._known: tuple[TourGraph, frozenset[int]] | None = None  # what these places are by
 
     def draw(self, scenes: TourScenes, camera: Camera) -> int | None:
         """Draw the plan into the current imgui window; returns the panorama that was clicked."""
         scale, tour = imgui.get_style().font_scale_dpi, scenes.tour
         others = find_other_storeys(tour, np.asarray(camera.position))
-        floors = {node: tour.draw(node, outline.corners) for node, outline in scenes.outlines.items()}
+        self._place(scenes)
+        dots = {node for node, place in self._drawn.items() if place.turn is None}
+        floors = {n: self._move(n, outline.corners) for n, outline in scenes.outlines.items() if n not in dots}
         cameras = tour.positions @ tour.level_axes[:, (0, 2)]
-        nodes = np.stack([tour.draw(node, place) for node, place in enumerate(cameras)])
+        nodes = np.stack([self._move(node, place) for node, place in enumerate(cameras)])
         places = np.concatenate([nodes, *floors.values()])
         low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
         factor, corner = SIZE * scale / float((high - low).max()), imgui.get_cursor_screen_pos()
@@ -92,9 +97,9 @@ class Minimap:
         imgui.dummy((width, height))
         hovered = imgui.is_item_hovered()
         for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
-            shown = [node for node in floors if (node in others) == is_other and node not in tour.approximate]
+            shown = [node for node in floors if (node in others) == is_other and node not in self._drawn]
             _draw_floors([to_pixels(floors[node]) for node in shown], colors, scale)
-        for node in tour.approximate.keys() & floors.keys():
+        for node in self._drawn.keys() & floors.keys():
             _draw_dashed(to_pixels(floors[node]), scale)
         self.nodes = [tuple(pixel) for pixel in to_pixels(nodes).tolist()]
         self._draw_marks(scenes, others, camera, to_pixels, scale)
@@ -109,6 +114,20 @@ class Minimap:
         reason = tour.panoramas[nearest].placement.reason
         imgui.set_tooltip("\n".join(filter(None, (describe_panorama(tour, nearest), reason))))
         return nearest if imgui.is_mouse_clicked(0) else None
+
+    def _place(self, scenes: TourScenes) -> None:
+        """Find the places of rooms beside others, by the floors that are known."""
+        tour, outlines = scenes.tour, scenes.outlines
+        if self._known != (tour, outlines.keys()):
+            self._known = tour, frozenset(outlines)
+            boxes = shapely.oriented_envelope([shapely.Polygon(outline.corners) for outline in outlines.values()])
+            corners = [shapely.get_coordinates(box)[:-1] for box in shapely.orient_polygons(boxes)]
+            unit = choose_camera_height((outline.camera_height for outline in outlines.values()), tour.far)
+            self._drawn = place_rooms(tour, dict(zip(outlines, corners, strict=True)), unit)
+
+    def _move(self, node: int, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where the plan shows places around a panorama."""
+        return self._drawn[node].move(places) if node in self._drawn else places
 
     def _draw_marks(
         self,
@@ -135,7 +154,7 @@ class Minimap:
                 canvas.add_circle_filled((x, y), 4.0 * scale, color)
         here = int(np.linalg.norm(tour.positions - np.asarray(camera.position), axis=1).argmin())
         points = (np.asarray(camera.position) + ahead * camera.rotation[:, 2] for ahead in (0, 1))
-        place, ahead = (tour.draw(here, point @ axes) for point in points)
+        place, ahead = (self._move(here, point @ axes) for point in points)
         heading = (ahead - place) / max(float(np.linalg.norm(ahead - place)), 1e-6)
         side = np.array((heading[1], -heading[0])) * math.tan(math.radians(min(camera.vertical_fov_degrees, 120)) / 2)
         ends = [to_pixels(place + _VIEW_LENGTH * (heading + sign * side)) for sign in (-1, 1)]

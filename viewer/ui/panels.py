@@ -46,6 +46,7 @@ from pansplat_viewer.window.input import KEYS
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
+_BAR_COLOR = (0.2, 0.4, 0.7, 1.0)  # of a progress that is behind a white text
 _PANEL = imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_bring_to_front_on_focus.value
 
 
@@ -110,10 +111,10 @@ class Panels:
         """Draw what everybody needs, open, and the rest, closed."""
         section = self.widgets.section
         self._draw_scene(viewer)
-        if viewer.state.context.size:
-            section("Photographs", partial(self._draw_photographs, viewer))
         if viewer.scenes.tour is not None:
             section("Plan", partial(self._draw_plan, viewer, viewer.scenes.tour))
+        if viewer.state.context.size:
+            section("Photographs", partial(self._draw_photographs, viewer))
         if viewer.scenes.notes or len(viewer.stage.photographs):
             section("Notes", partial(self._draw_notes, viewer))
         section("Film", partial(self._draw_film, viewer))
@@ -138,19 +139,21 @@ class Panels:
 
     def _draw_plan(self, viewer: Viewer, tour: TourScenes) -> None:
         """Draw the floor plan and the list of panoramas, and the progress of the prediction."""
-        state = viewer.state
+        state, nodes = viewer.state, range(len(tour.tour))
+        is_known = len(tour.outlines) > 0 or any(map(tour.tour.is_placed, nodes))  # else all are side by side
         state.minimap = self.widgets.check("floor plan", state.minimap)
         imgui.same_line()
         state.hotspots = self.widgets.check("hotspots", state.hotspots)
-        if state.minimap:
+        if state.minimap and is_known:
             clicked = self.minimap.draw(tour, state.camera)
             state.target = state.target if clicked is None else clicked
             if tour.tour.approximate:
                 imgui.text_disabled("dashed: about here")
         imgui.set_next_item_width(-1)
-        if imgui.begin_combo("##visit", describe_panoramas(tour.tour)):
-            for node in range(len(tour.tour)):
-                if imgui.selectable(f"{node + 1}. {describe_panorama(tour.tour, node)}", False)[0]:
+        if imgui.begin_combo("##visit", describe_panoramas(tour.tour) if is_known else "go to a photograph"):
+            for node in nodes:
+                label = describe_panorama(tour.tour, node) if is_known else tour.tour.panoramas[node].label
+                if imgui.selectable(f"{node + 1}. {label}", False)[0]:
                     state.target = node
                 self.widgets.record(f"visit {node}")
             imgui.end_combo()
@@ -287,10 +290,16 @@ class Panels:
         """Draw the progress of a load."""
         size, scale = imgui.get_io().display_size, imgui.get_style().font_scale_dpi
         imgui.set_next_window_pos((size.x / 2, size.y - 6 * MARGIN * scale), 0, (0.5, 1.0))
-        imgui.set_next_window_size((min(420 * scale, size.x - 2 * MARGIN), 0))
+        imgui.set_next_window_size((min(620 * scale, size.x - 2 * MARGIN), 0))
         imgui.begin("##progress", None, FIXED | imgui.WindowFlags_.no_title_bar.value)
-        imgui.text_unformatted(f"{name}: {task}")
-        imgui.progress_bar(fraction, (-80 * imgui.get_style().font_scale_dpi, 0), f"{100 * fraction:.0f}%")
+        text = ", ".join(filter(None, (f"{name}: {task}", viewer.scenes.loader.describe_time())))
+        at = fraction or -viewer.state.now  # a bar that moves, while nothing is done
+        imgui.push_style_color(imgui.Col_.plot_histogram.value, _BAR_COLOR)
+        imgui.progress_bar(at, (-80 * scale, 0), "")
+        imgui.pop_style_color()
+        corner, white = imgui.get_item_rect_min(), imgui.color_convert_float4_to_u32((1.0, 1.0, 1.0, 1.0))
+        place = corner.x + 6 * scale, corner.y + imgui.get_style().frame_padding.y
+        imgui.get_window_draw_list().add_text(place, white, text)
         imgui.same_line()
         if self.widgets.button("Cancel##loading"):
             viewer.queue(viewer.scenes.cancel_loading)

@@ -9,6 +9,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.tours.route import find_offset
 from pansplat_viewer.draw.programs import Programs
 from pansplat_viewer.scene import camera as cameras
 
@@ -50,9 +51,10 @@ class Presenter:
     def draw_photograph(
         self, photograph: PosedPhotograph, target: moderngl.Framebuffer, camera: cameras.Camera
     ) -> None:
-        """Fill `target` with a photograph, at an infinite distance around its camera."""
+        """Fill `target` with a photograph, on a sphere around its camera."""
         rotation = photograph.pose[:3, :3].T @ camera.rotation
         self._program["camera_to_photo"] = tuple(rotation.T.ravel().tolist())  # column by column
+        self._program["beside"] = tuple(find_offset(photograph.pose, np.asarray(camera.position)).tolist())
         width, height = target.viewport[2:]
         tangent = math.tan(math.radians(camera.vertical_fov_degrees) / 2)
         self._program["tangent"] = (tangent * width / height, tangent)

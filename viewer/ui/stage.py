@@ -59,8 +59,7 @@ class Stage:
         self.presenter = Presenter(ctx)
         self.photographs = Photographs(ctx)
         self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
-        self._stop_layer, self._cut_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
-        self._stop_camera = state.camera  # of the last frame before a cut
+        self._stop_layer, self._zoom_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
         self.resolution = self._create_resolution()
         self.size: tuple[int, int] = (1, 1)
         self.has_failed = False
@@ -144,7 +143,7 @@ class Stage:
             ready = can_wait and self.preparer.is_ready(loaded.scene)
             if not ready or not self.upload(self.slots[slot], loaded.scene, loaded.entry.name):
                 return False
-        self.fade.show(slot, loaded.scene, self._state.now, part)
+        self.fade.show(slot, loaded.scene, self._state.now, part, at_once=self.stop.is_whole)
         self._scene_slot, self.scene_views = slot, loaded.entry.views
         adapt_settings(self._state, loaded.scene)
         self._state.points = []
@@ -155,7 +154,7 @@ class Stage:
         self.fade.compute_weight(self._state.now)
         slot = None if index is None else self.fade.choose_slot(index)
         if index is not None and slot is not None and self.get_photograph(index) is not None:
-            self.fade.show(slot, index, self._state.now, part)
+            self.fade.show(slot, index, self._state.now, part, at_once=self.stop.is_whole)
 
     def get_photograph(self, index: int) -> PosedPhotograph | None:
         """A photograph; None while it is read, and if it cannot be, which is shown as an error once."""
@@ -186,9 +185,10 @@ class Stage:
         self._ctx.clear(*self._state.settings.background)
 
     def _draw_image(self, target: moderngl.Framebuffer) -> None:
-        state, plan, weight, fading = self._state, self._plan_resolution(), 1.0, None
+        state, plan, weight = self._state, self._plan_resolution(), 1.0
+        image = fading = None
         (stop, before), milliseconds = self._draw_stop(), 0.0
-        if stop is None or (self.stop.weight < 1 and before is None) or not plan.moving:
+        if stop is None or (before is None and (self.stop.weight < 1 or not plan.moving)):
             weight = self.fade.compute_weight(state.now)
             image, milliseconds = self._draw_content(self.fade.front, plan)
             if weight < 1:
@@ -211,30 +211,33 @@ class Stage:
         self.presenter.draw(image, target, fading=fading, weight=weight)
 
     def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
-        """The photograph of the panorama at which the camera stands, or stood until now, and the one before a cut."""
-        state, fade = self._state, self.fade
-        index = self._find_stop()
-        photograph = None if index is None else self.get_photograph(index)
-        was_shown = fade.compute_weight(state.now) < 1 and fade.contents[1 - fade.front] == index
-        self.stop.update(None if photograph is None else index, state.now, at_once=was_shown)
-        if self.stop.weight <= 0 or self.stop.index is None:
+        """The photograph of the panorama at which the camera stands, or stood until now; of a zoom, both."""
+        state, fade, moment = self._state, self.fade, self._state.moment
+        is_zoom = moment is not None and moment.arrival is not None
+        if moment is not None and self._shows_stops and (is_zoom or self.photograph is None):
+            self.stop.follow(moment, state.now)
+        else:
+            index = self.photographs.find_stop(np.asarray(state.camera.position)) if self._shows_stops else None
+            index = (
+                None if index is None or self.photograph is not None or self.get_photograph(index) is None else index
+            )
+            was_shown = fade.compute_weight(state.now) < 1 and fade.contents[1 - fade.front] == index
+            self.stop.update(index, state.now, at_once=was_shown)
+        photograph = None if self.stop.index is None else self.get_photograph(self.stop.index)
+        if photograph is None or self.stop.weight <= 0:
             return None, None
-        photograph = photograph if self.stop.index == index else self.get_photograph(self.stop.index)
-        if photograph is None:
-            return None, None
+        camera, below = state.camera, None
         before = None if self.stop.before is None else self.get_photograph(self.stop.before)
-        if before is None:
-            self._stop_camera = state.camera
-        below = before and self._cut_layer.draw(before, self._stop_camera, self.size)
-        return self._stop_layer.draw(photograph, state.camera, self.size), below
+        if moment is not None and moment.arrival is not None:
+            narrow = replace(camera, vertical_fov_degrees=moment.narrowing * camera.vertical_fov_degrees)
+            camera = cameras.move_to_pose(camera, moment.arrival)
+            below = before and self._zoom_layer.draw(before, narrow, self.size)
+        return self._stop_layer.draw(photograph, camera, self.size), below
 
-    def _find_stop(self) -> int | None:
-        """The panorama at which the camera stands, if its scene is shown as it is."""
-        state, settings = self._state, self._state.settings
-        is_whole = settings.shows_scene and self.photograph is None
-        if not (state.stops and is_whole):
-            return None
-        return self.photographs.find_stop(np.asarray(state.camera.position))
+    @property
+    def _shows_stops(self) -> bool:
+        """Whether photographs are shown at panoramas."""
+        return self._state.stops and self._state.settings.shows_scene and len(self.photographs) > 0
 
     def _plan_resolution(self) -> ResolutionPlan:
         """The plan of the frame, from the movement since the last one."""
@@ -280,7 +283,7 @@ class Stage:
     def release(self) -> None:
         """Stop the threads and free every GL object."""
         self.preparer.close()
-        for layer in (*self._layers, self._stop_layer, self._cut_layer):
+        for layer in (*self._layers, self._stop_layer, self._zoom_layer):
             layer.release()
         self.presenter.release()
         self.photographs.release()

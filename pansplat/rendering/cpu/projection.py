@@ -48,9 +48,9 @@ from pansplat.system.kernels import Workspace, inline_kernel, kernel, parallel_f
 
 GAUSSIAN_BLOCK = 64
 GAUSSIANS_PER_ITEM = 8192
-CULLED = -128.0  # log2_peak of a culled Gaussian
+CULLED = -128.0  # log2_peak that marks a Gaussian as culled
 
-_MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # without the sign
+_MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # the sign is shifted out
 
 # Rows of a block: inputs and results.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 10  # the shape is a quaternion and three scales
@@ -235,7 +235,7 @@ def _validate_harmonics(harmonic_bits, size, start, count, rows):
         prefetch(harmonic_bits, size * (start + PREFETCH_DISTANCE) + j)
     block = harmonic_bits[start * size : (start + count) * size]
     for j in range(block.shape[0]):
-        bits = np.uint32(block[j] << np.uint32(1))  # without the sign
+        bits = np.uint32(block[j] << np.uint32(1))  # this shifts out the sign
         largest = bits if bits > largest else largest
     if largest < _MAX_MAGNITUDE_BITS:
         return

@@ -12,11 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.export.film import Film, Shot, list_flight
+from pansplat.export.film import Film, Shot
 from pansplat.tours.cross_fade import CrossFade
-from pansplat.tours.route import FADE_SECONDS, plan_route
+from pansplat.tours.route import FADE_SECONDS, REST_SECONDS, plan_route
 from pansplat_viewer import run
-from pansplat_viewer.capture import find_nearest_frames, open_film, write_flight
+from pansplat_viewer.capture import open_film, write_flight
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.hotspots import find_hotspots
@@ -92,35 +92,32 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
     first = SceneEntry(house.name, tour=house, pair=house.make_pair((0, 1)), views=(0, 1), start=1, max_views=64)
     scenes = TourScenes.start(load_house(first))
     camera = scenes.tour.cam2world[0].numpy()
-    assert scenes.plan_way(camera, 1).fades == () and "fades" not in describe_panoramas(scenes.tour)
+    assert scenes.plan_way(camera, 1).steps[0].kind == "flight" and "fades" not in describe_panoramas(scenes.tour)
     (part,) = scenes.list_next(None, 0.0)
     for _ in range(2):
         loaded = load_house(scenes.make_entry(part))
         vars(loaded.facts).update(poor=[(0, 1), (0, 3)])
         scenes.add(loaded)
     assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
-    assert len(scenes.plan_way(camera, 1).fades) == 1
+    assert scenes.plan_way(camera, 1).steps[0].kind == "zoom"
     edges = sum(a != b for a, b in scenes.tour.overlaps)
     assert describe_panoramas(scenes.tour).endswith(f"; {edges - 1} flights, 1 fade")
 
 
-def test_after_a_cut_a_photograph_fades_from_the_one_before_and_not_from_the_scene():
-    stop, weights = StopFade(), []
-    for frame in range(10):
-        stop.update(3, 0.1 * frame)
-    assert (stop.index, stop.before, stop.weight) == (3, None, 1)
-    for frame in range(10, 40):
-        stop.update(5, 0.1 * frame)
-        assert stop.index == 5 and stop.before == (3 if stop.weight < 1 else None)
-        weights.append(stop.weight)
-    assert weights[0] < 0.02 and weights.index(1) == pytest.approx(10 * FADE_SECONDS, abs=1)
-    assert np.diff(weights[:10]).min() > 0.05
-    stop.update(None, 4.0)
-    assert (stop.index, stop.before) == (5, None) and stop.weight < 1, "into the scene"
-    stop = StopFade()
-    for time, index in ((0.0, 3), (1.0, 3), (1.5, 3), (2.0, 5), (2.1, None), (3.0, None), (4.0, None)):
-        stop.update(index, time)
-    assert (stop.before, stop.weight) == (None, 0), "a cut to a photograph that is left at once"
+def test_a_zoom_shows_both_photographs_and_ends_in_that_of_its_goal(parted_house):
+    route, stop = plan_route(parted_house, [2, 3]), StopFade()
+    stop.update(2, 0.0)
+    shown = []
+    for seconds in np.arange(0, route.steps[0].seconds, 1 / 30):
+        moment = route.at(seconds / route.seconds)
+        stop.follow(moment, seconds)
+        shown.append((stop.before, stop.index, stop.weight))
+        assert stop.is_whole, "nothing is seen of the scene"
+    assert shown[0] == (2, 3, 0) and shown[-1][:2] == (2, 3) and 0.9 < shown[-1][2] < 1
+    stop.update(3, route.seconds)
+    assert (stop.before, stop.index, stop.weight) == (None, 3, 1)
+    stop.update(None, route.seconds + 0.1)
+    assert stop.index == 3 and stop.weight < 1, "into the scene"
 
 
 def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
@@ -135,7 +132,7 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
     assert scenes.tour.walls == ((0, 1), (2, 3)) and scenes.tour.parts == (0, 1, 1, 2)
     assert scenes.edge == (0, 0) and scenes.get(scenes.views) is not None, "the camera stays where it is"
     assert scenes.list_next(None, 0.0) == [part]
-    assert scenes.plan_way(house.cam2world[0].numpy(), 2).fades == (0,)
+    assert [step.kind for step in scenes.plan_way(house.cam2world[0].numpy(), 2).steps] == ["zoom", "flight"]
     camera = Camera(position=tuple(house.positions[0].tolist()))
     (hotspot,) = find_hotspots(scenes, camera, (200, 200))
     assert hotspot.node == 1 and hotspot.is_fade, "a ring leads through the wall"
@@ -232,11 +229,11 @@ def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house
     assert scenes.views == (3,) and scenes.part == 1, "after a jump"
     assert scenes.list_next(None, 0.0)[:2] == [(3,), (1, 2)]
     route = scenes.plan_way(parted_house.cam2world[3].numpy(), 0)
-    assert route.walk == (3, 2, 1, 0) and route.fades == (0,)
+    assert route.walk == (3, 2, 1, 0) and "zoom" in [step.kind for step in route.steps]
     scenes.add(load_house(scenes.make_entry((3,))))
     assert scenes.list_next(route, 0.0) == [(3,), (1, 2), (0, 1)], "those of the route"
     assert scenes.camera_height == 1.0
-    scenes.move(route.pose(1.0)[:3, 3], route.edge(1.0))
+    scenes.move(route.pose(1.0)[:3, 3], route.at(1.0).step.edge)
     assert scenes.views == (0, 1)
 
 
@@ -253,31 +250,20 @@ def open_tour_film(load_house) -> Iterator[Callable[..., Film]]:
         yield open_one
 
 
-def test_the_film_of_a_fade_between_parts_mixes_both_last_views(parted_house, open_tour_film):
+def test_the_film_of_a_zoom_mixes_the_views_of_both_panoramas(parted_house, open_tour_film):
     film = open_tour_film(TourScenes(parted_house))
     route = plan_route(parted_house, [2, 3])
-    (jump,) = route.jumps
+    zoom = route.steps[0]
 
-    def draw(sample: int, seconds: float) -> np.ndarray:
-        at = sample / (len(route.legs) - 1)
-        return film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at)))
+    def draw(part: float) -> np.ndarray:
+        """The frame after a part of the zoom."""
+        at = part * zoom.seconds / route.seconds
+        moment = route.at(at)
+        return film.draw(Shot.of_moment(moment, 75.0, at * route.seconds))
 
-    before = draw(jump, 0.0)
-    assert np.abs(draw(jump + 1, 1.0) - before).max() < 1e-6, "the fade begins with the last view"
-    middle = draw(jump + 1, 1.0 + FADE_SECONDS / 2)
-    after = draw(jump + 1, 1.0 + FADE_SECONDS)
-    assert np.abs(after - before).mean() > 0.1 and np.abs(middle - (before + after) / 2).max() < 1e-6
-
-
-def test_the_still_of_a_panorama_is_a_frame_in_which_the_last_part_has_faded_out(parted_house):
-    route = plan_route(parted_house, [2, 3])
-    shots = list_flight(route, 24.0, 75.0, 200 / 24)
-    frames = find_nearest_frames(parted_house, route, shots)
-    nodes = {node: shots[frame] for frame, nodes in frames.items() for node in nodes}
-    jump = route.jumps[0] / (len(route.yaws) - 1) * route.seconds
-    assert nodes[2].seconds < jump and nodes[3].seconds >= jump + FADE_SECONDS
-    for node in (2, 3):
-        assert np.linalg.norm(nodes[node].pose[:3, 3] - parted_house.positions[node]) < 0.1
+    before, grown, last, after = (draw(part) for part in (0.001, 0.3, 0.999, 1.0))
+    assert np.abs(grown - before).mean() > 1e-3 and np.abs(after - before).mean() > 0.1
+    assert np.abs(last - after).max() < 0.01, "no jump at the end"
 
 
 def read_film(path) -> np.ndarray:
@@ -292,7 +278,7 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         loaded.append(entry.views)
         return load_house(entry)
 
-    route = plan_route(house, house.plan_walk(0))
+    route = plan_route(house, house.plan_walk(0), rest=REST_SECONDS)
     written, complete = [], []
 
     def show_file(file):
@@ -324,10 +310,11 @@ def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_e
     times = np.arange(0, route.seconds, 1 / 20)  # steps of 5 cm at most
     shown, edges = [], []
     for seconds in times:
-        at = seconds / route.seconds
-        shown.append(film.draw(Shot(route.pose(at), 75.0, seconds, route.edge(at))))
+        moment = route.at(seconds / route.seconds)
+        shown.append(film.draw(Shot.of_moment(moment, 75.0, seconds)))
         edges.append(scenes.edge)
-    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3))
+    turning = np.array([route.at(seconds / route.seconds).step.kind == "turn" for seconds in times])
+    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3)) * ~(turning[:-1] | turning[1:])
     changes = [k for k, (a, b) in enumerate(itertools.pairwise(edges)) if a != b]
     is_fading = np.any([(times[:-1] >= times[k]) & (times[:-1] < times[k] + FADE_SECONDS) for k in changes], axis=0)
     assert len(changes) == 2 and 10 < is_fading.sum() < len(steps) - 10
