@@ -106,6 +106,22 @@ def recipe(shared: Path) -> Callable[[str], dict[str, torch.Tensor]]:
 
 
 @pytest.fixture(scope="session")
+def randomize() -> Callable[[torch.nn.Module], torch.nn.Module]:
+    """Fill a network with float64 noise, so that no layer is an identity or zero; in eval mode."""
+
+    def fill(module: torch.nn.Module) -> torch.nn.Module:
+        generator = torch.Generator().manual_seed(5)
+        module = module.double().eval()
+        with torch.no_grad():
+            for parameter in module.parameters():
+                fan_in = max(1, parameter[0].numel())
+                parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64) / fan_in**0.5)
+        return module
+
+    return fill
+
+
+@pytest.fixture(scope="session")
 def recipe_weights(recipe: Callable[[str], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
     """The 993 tensors of the official PanSplat without the prefix "encoder."; 200 MB, read-only."""
     return recipe("pansplat-512")

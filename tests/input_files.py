@@ -31,7 +31,7 @@ from pansplat.inputs.folders import load_pairs, load_panoramas
 from pansplat.inputs.formats import FORMATS
 from pansplat.model.network import build_empty_network
 from pansplat.model.pansplat import PanSplatConfig
-from pansplat.model.weights import WeightsFile, load_weights, read_checkpoint
+from pansplat.networks.weights import WeightsFile, load_weights, read_checkpoint
 from pansplat.pipeline import render
 from pansplat.system.files import SCENE_SUFFIXES
 from pansplat.system.store import Store, _pack

@@ -21,7 +21,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.inputs.pairs import Pair
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load, load_pairs, predict, predict_to_file, predict_tour, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
@@ -60,7 +60,7 @@ def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predic
         predictor.default_height = largest
     for panorama, height in zip(pair.context, (photographs, 2 * photographs), strict=True):
         Image.new("RGB", (2 * height, height), "red").save(panorama.image)
-    assert pipeline.choose_height(pair, predictor) == expected
+    assert pipeline.prediction.choose_height(pair, predictor) == expected
     if expected == 64:
         assert predict(pair_folder, predictor, cache=False).height == expected
 
@@ -262,7 +262,7 @@ def masked_pair(tmp_path: Path, write_pair) -> Path:
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_config) -> Path:
     """Weights of a small network that cuts panoramas of 64 rows into four tiles; the command streams such panoramas."""
     monkeypatch.setattr(network, "_UNTILED_HEIGHT", TILED_HEIGHT // 2)
-    monkeypatch.setattr(pipeline, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
+    monkeypatch.setattr(pipeline.prediction, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
     save_weights(path, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
@@ -297,7 +297,7 @@ def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(
     (pair,) = load_pairs(write_pair(tmp_path / "pair", height=64))
     for height, rows in ((16, 32), (48, 64), (64, 64)):
         assert pipeline.load_photographs(pair, height).images.shape[-2] == rows
-    monkeypatch.setattr(pipeline, "DISPLAY_HEIGHT", 24)
+    monkeypatch.setattr(pipeline.prediction, "DISPLAY_HEIGHT", 24)
     assert pipeline.load_photographs(pair, 16).images.shape[-2] == 24
     assert pipeline.load_photographs(pair, 48).images.shape[-2] == 48
 
@@ -307,7 +307,7 @@ def test_the_predict_command_streams_large_predictions(
     masked_pair: Path, weights: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     command = ["predict", str(masked_pair), "--model", str(weights), "--height", str(TILED_HEIGHT), "--degree", "0"]
-    monkeypatch.setattr(pipeline, "predict", None)  # must not be called
+    monkeypatch.setattr(pipeline.prediction, "_run", None)  # must not be called
     assert run([*command, "-o", str(tmp_path / "tiles.ply")]) == 0
     assert "Gaussians from left, right in" in capsys.readouterr().out
     monkeypatch.undo()
@@ -378,7 +378,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     parted_tour: TourGraph, sphere_predictor: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     of_pairs, of_single_views = sphere_predictor(), sphere_predictor()
-    monkeypatch.setitem(pipeline._MODELS, "default", lambda: of_single_views)
+    monkeypatch.setitem(pipeline.models._MODELS, "default", lambda: of_single_views)
     with pytest.warns(InputWarning, match=r"house tour: 1 single view is predicted by default, because pairs needs 2"):
         scene = predict_tour(parted_tour, PairsOnly(of_pairs), cache=False)
     assert len(scene.cam2world) == 3 and (of_pairs.calls, of_single_views.calls) == (1, 1)

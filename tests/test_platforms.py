@@ -13,7 +13,7 @@ from refusals import expect_error
 
 from pansplat.gaussians import formats
 from pansplat.inputs.folders import load_pairs
-from pansplat.model.weights import load_weights, pack_weights, save_weights
+from pansplat.networks.weights import load_weights, pack_weights, save_weights
 from pansplat.system import console
 from pansplat.system.files import make_portable_name, require_output_folder
 from pansplat.system.kernel_cache import choose_kernel_cache

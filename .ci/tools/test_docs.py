@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 import pansplat
-from pansplat.cli import parse
+from pansplat.cli import _COMMANDS, parse
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
@@ -36,9 +36,16 @@ def test_calls_of_the_readme_exist() -> None:
     calls = set(re.findall(r"pansplat\.(\w+)\(", README))
     assert calls >= {"predict", "render", "load_model", "rasterize", "save", "load"} and calls <= set(pansplat.__all__)
     assert all(callable(getattr(pansplat, name)) for name in pansplat.__all__)
-    assert set(pansplat.pipeline.__all__) <= set(pansplat.__all__)
     pictures = re.findall(r"^(?:image|picture) = pansplat\.(\w+)\(.*\)\.color", README, re.MULTILINE)
     assert pictures == ["render", "rasterize"], "a tensor, not a `Rendering`"
+
+
+def test_the_promise_names_every_command_and_public_name() -> None:
+    _, _, commands, names, _ = re.split(
+        r"^\*\*.*?\*\*", (ROOT / "docs/promise.md").read_text("utf-8"), flags=re.MULTILINE
+    )
+    assert set(_COMMANDS) <= set(re.findall(r"`([\w-]+)`", commands))
+    assert set(re.findall(r"`(\w+)`", names)) == {"pansplat", *pansplat.__all__}
 
 
 def test_links_of_the_readme_exist_and_lead_to_every_document() -> None:

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -137,6 +138,36 @@ def test_an_installed_wheel_needs_its_dependencies_only(installed: Path, tmp_pat
     run_in(installed, sys.executable, "-c", program, ",".join(foreign), tmp_path / "scene.ply", *options)
     with av.open(str(tmp_path / "out" / "flythrough.mp4")) as film:
         assert len(list(film.decode(video=0))) > 1
+
+
+def test_the_python_of_the_readme_runs_from_an_installed_wheel(
+    installed: Path, tmp_path: Path, write_pair: Callable[..., Path], write_tour: Callable[..., Path]
+) -> None:
+    """On small photographs, with numba's compiled kernels of this checkout, and without all other packages."""
+    for compiled in (ROOT / "pansplat").rglob("*.nb[ic]"):
+        copy = installed / compiled.relative_to(ROOT)
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copy(compiled, copy)
+    write_pair(tmp_path / "my_pair", height=64)
+    write_tour(tmp_path / "my_house", 3)
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    program = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(sys.argv.pop(1).split(',')))\n"
+        "import torch\n"
+        "images, cam2world = torch.rand(2, 3, 64, 128), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)\n"
+        "cam2world[1, 0, 3] = 0.5\n"
+        f"{code}\n"
+        "print(pansplat.__file__, *image.shape, len(house.cam2world), *picture.shape)\n"
+    )
+    output = run_in(installed, sys.executable, "-c", program, ",".join(find_foreign_modules()), cwd=tmp_path).split()
+    assert Path(output[0]).is_relative_to(installed) and output[1:] == ["3", "64", "128", "3", "3", "512", "1024"]
+    assert (tmp_path / "scene.ply").is_file()
+
+
+def test_the_installed_numba_is_within_an_upper_bound() -> None:
+    (numba,) = (each for each in map(Requirement, PROJECT["dependencies"]) if each.name == "numba")
+    assert importlib.metadata.version("numba") in numba.specifier and "99" not in numba.specifier
 
 
 def test_setup_pins_every_direct_dependency() -> None:

@@ -37,12 +37,12 @@ from pansplat.evaluation.results import Column, Row
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.inputs.views import Views
 from pansplat.model.heads import merge_tiles
-from pansplat.model.layers import Compat, Precision
 from pansplat.model.network import build_network
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.weights import load_weights, pack_weights, save_weights
+from pansplat.networks.layers import Compat, Precision
+from pansplat.networks.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import render
-from pansplat.rendering.cpu.runtime import release_idle_memory
+from pansplat.system.kernels import release_idle_memory
 from pansplat.training.network import network_config
 
 if TYPE_CHECKING:

@@ -41,10 +41,10 @@ from pansplat.evaluation.results import Column, Row
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import rasterize
-from pansplat.rendering.cpu.runtime import release_idle_memory
 from pansplat.rendering.image_planes import Layout
 from pansplat.rendering.official import official_face_size
 from pansplat.rendering.rasterize import Kernel
+from pansplat.system.kernels import release_idle_memory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -108,7 +108,7 @@ class BenchModel(_Options):
         """Measure, print the table and write the files; an interruption keeps the measured rows."""
         from pansplat.bench.model import MODEL, list_model_cases, measure_model, save_random_weights
         from pansplat.model.network import has_bfloat16
-        from pansplat.model.weights import load_weights
+        from pansplat.networks.weights import load_weights
 
         weights = "random (seed 0): images are meaningless" if self.model is None else self.model.name
         threads = self._check("model")

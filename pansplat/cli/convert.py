@@ -26,7 +26,8 @@ class Convert(Writer):
     def run(self) -> int:
         """Convert and save, and print what is left out."""
         from pansplat.model.network import convert_checkpoint
-        from pansplat.model.weights import match_tensors, read_checkpoint, save_weights
+        from pansplat.model.official_weights import match_tensors
+        from pansplat.networks.weights import read_checkpoint, save_weights
 
         require_output_file("--out", self.out, (".safetensors",), overwrite=self.overwrite)
         content = read_checkpoint(self.path)

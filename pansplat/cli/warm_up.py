@@ -28,7 +28,7 @@ def main() -> None:
 
 def compile_kernels(group: int) -> None:
     """Compile the kernels of a group of `STEPS` in this process, without a message about it."""
-    from pansplat.rendering.cpu.runtime import hide_message
+    from pansplat.system.kernels import hide_message
 
     hide_message()
     for step in STEPS[group]:

@@ -28,7 +28,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from pansplat.errors import InputError
-from pansplat.model.weights import read_checkpoint
+from pansplat.networks.weights import read_checkpoint
 from pansplat.system.files import expand_home
 
 Backbone = Literal["vgg", "alex", "squeeze"]

@@ -21,7 +21,7 @@ from torch.nn import functional
 from pansplat.geometry.correlation import correlate
 from pansplat.geometry.equirect import Border
 from pansplat.geometry.warp import Sampling, relative_pose
-from pansplat.model.layers import (
+from pansplat.networks.layers import (
     Compat,
     ConvNorm,
     Maps,

@@ -17,7 +17,7 @@ from msgspec import Meta
 from torch import Tensor, nn
 
 from pansplat.geometry.equirect import Border
-from pansplat.model.layers import (
+from pansplat.networks.layers import (
     Compat,
     ConvNorm,
     Images,

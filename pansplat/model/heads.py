@@ -29,7 +29,6 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import directions_from_uv
 from pansplat.geometry.pose import multiply_quats, quats_from_rotations
 from pansplat.model.cost_volume import Depths, LevelDepth
-from pansplat.model.layers import Compat, Factor, Images, PerView, Poses, Precision, Size, autocast_convolutions
 from pansplat.model.tiles import (
     Margins,
     Tile,
@@ -41,6 +40,7 @@ from pansplat.model.tiles import (
     sample_panorama,
     sample_window,
 )
+from pansplat.networks.layers import Compat, Factor, Images, PerView, Poses, Precision, Size, autocast_convolutions
 
 _SCALE_UNIT = 0.2  # pixels of the map that a scale of 1 stands for
 # The polar axis of the network's harmonics is y: their k-th function of d is the 3DGS function of _POLAR_Y @ d.

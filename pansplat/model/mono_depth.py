@@ -24,7 +24,7 @@ from torch.nn.functional import elu, interpolate, max_pool2d, relu
 from pansplat.geometry.cubemap import equirect_from_strip, strip_from_equirect, strip_lookup
 from pansplat.geometry.equirect import Border, pad_equirect
 from pansplat.model.feature_pyramid import normalize
-from pansplat.model.layers import (
+from pansplat.networks.layers import (
     Compat,
     Images,
     PanoramaConv2d,

@@ -18,14 +18,14 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas, uv_from_directions
 from pansplat.geometry.world import require_working_world
 from pansplat.model.heads import MatchedViews, TileGaussians, merge_tiles
-from pansplat.model.layers import Compat, Precision, require_views
+from pansplat.model.official_weights import convert_tensors
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.weights import (
+from pansplat.networks.layers import Compat, Precision, require_views
+from pansplat.networks.weights import (
     CHECKPOINT_SUFFIXES,
     WeightsFile,
     build_on_meta,
     config_from_dict,
-    convert_tensors,
     load_weights,
     pack_weights,
     read_checkpoint,

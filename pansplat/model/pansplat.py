@@ -15,9 +15,9 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.model.cost_volume import CostVolumeConfig, Depths, SphericalCostVolume
 from pansplat.model.feature_pyramid import FeaturePyramid, FeaturePyramidConfig
 from pansplat.model.heads import GaussianHeads, HeadsConfig, MatchedViews, TileGaussians, merge_tiles
-from pansplat.model.layers import Compat, Images, PerView, Poses, Precision, autocast_convolutions, resize
 from pansplat.model.mono_depth import MonocularDepth
-from pansplat.model.weights import ModelName
+from pansplat.networks.layers import Compat, Images, PerView, Poses, Precision, autocast_convolutions, resize
+from pansplat.networks.weights import ModelName
 
 MATCHING_HEIGHT = 512
 """Largest height of the images for feature matching; the heads read them at full size."""

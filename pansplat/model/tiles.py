@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from pansplat.geometry.equirect import pad_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size, official_fibonacci_uv
-from pansplat.model.layers import Compat
+from pansplat.networks.layers import Compat
 
 _MIN_COS_LATITUDE = 0.01  # limits the width of a pixel in longitude at the poles
 

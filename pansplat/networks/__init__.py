@@ -1,1 +1,1 @@
-"""Networks that are not the paper's: depth of panoramas, and the matcher of photographs (ALIKED, LightGlue)."""
+"""Layers and weights of all networks, and the networks that are not the paper's: depth of panoramas, matching."""

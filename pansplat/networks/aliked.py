@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pansplat.model.layers import to_channels_last
+from pansplat.networks.layers import to_channels_last
 
 _CHANNELS = (16, 32, 64, 128)  # channels of the levels
 _STRIDES = (1, 2, 8, 32)  # pixels; steps of the levels

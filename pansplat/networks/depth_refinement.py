@@ -24,7 +24,6 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize, relu, unfold
 from pansplat.geometry.correlation import correlate, correlate_positions
 from pansplat.geometry.equirect import pad_equirect, pixel_directions
 from pansplat.geometry.warp import relative_pose, sample_maps, warp_positions
-from pansplat.model.layers import ConvNorm, Factor, PanoramaConv2d, Size, to_channels_last
 from pansplat.networks.depth_network import (
     MAX_LOG_SCALE,
     DepthEstimate,
@@ -33,6 +32,7 @@ from pansplat.networks.depth_network import (
     UpsampleAndMerge,
 )
 from pansplat.networks.efficientnet import CHANNELS
+from pansplat.networks.layers import ConvNorm, Factor, PanoramaConv2d, Size, to_channels_last
 
 _PATCH, _PATCH_STEP = 3, 2  # width of a patch, and pixels between its samples
 _PATCH_NOISE = 0.02  # standard deviation of a patch below which its correlation fades

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle, relu, unfold
 
 from pansplat.geometry.equirect import pad_equirect, resize_equirect
-from pansplat.model.layers import PanoramaConv2d, Size, convolve_and_normalize
 from pansplat.networks.depth_network import (
     MAX_LOG_SCALE,
     MEAN_LOG_DEPTH,
@@ -25,6 +24,7 @@ from pansplat.networks.depth_network import (
     DepthNetworkConfig,
     RoomNetwork,
 )
+from pansplat.networks.layers import PanoramaConv2d, Size, convolve_and_normalize
 
 _ESTIMATE_CHANNELS = 3  # log-depth, its log-scale, latitude
 _NEIGHBOURS = 9  # pixels around a pixel and itself, whose depths it chooses from

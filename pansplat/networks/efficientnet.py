@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu6
 
-from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize
+from pansplat.networks.layers import PanoramaConv2d, convolve_and_normalize
 
 _EPSILON, _MOMENTUM = 1e-3, 0.01  # settings of batch normalisation
 _STEM_CHANNELS = 32

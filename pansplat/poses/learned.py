@@ -24,9 +24,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray as Array
 from torch import Tensor, nn
 
-from pansplat.model.weights import load_weights, require_shapes
 from pansplat.networks.aliked import Aliked
 from pansplat.networks.lightglue import LightGlue
+from pansplat.networks.weights import load_weights, require_shapes
 from pansplat.poses.features import FACE_ROTATIONS, Matches, are_distinct, render_face, sample_mask
 
 _FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no upright direction

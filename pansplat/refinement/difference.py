@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for, pooled_empty, thread_count
+from pansplat.system.kernels import inline_kernel_no_refcount, kernel, parallel_for, pooled_empty, thread_count
 
 _ROWS_PER_ITEM = 16  # rows of an image that a thread processes together
 _CHANNELS = 3

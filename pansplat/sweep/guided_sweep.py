@@ -17,8 +17,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pansplat.errors import InputError
-from pansplat.model.layers import to_channels_last
-from pansplat.model.weights import (
+from pansplat.networks.depth_network import DepthEstimate
+from pansplat.networks.depth_refinement import DepthRefinement, Observations, RefinementConfig
+from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.networks.layers import to_channels_last
+from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
+from pansplat.networks.weights import (
     build_on_meta,
     config_from_dict,
     load_weights,
@@ -26,10 +30,6 @@ from pansplat.model.weights import (
     require_shapes,
     save_weights,
 )
-from pansplat.networks.depth_network import DepthEstimate
-from pansplat.networks.depth_refinement import DepthRefinement, Observations, RefinementConfig
-from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
-from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
 from pansplat.sweep import Sweep
 from pansplat.sweep.joined_crops import crop_panorama, join_crops
 from pansplat.sweep.prior import DepthPrior

@@ -26,7 +26,6 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
-from pansplat.rendering.cpu.runtime import cached_njit
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
@@ -43,6 +42,7 @@ from pansplat.sweep.surface import (
     resize_mask,
     resize_sphere,
 )
+from pansplat.system.kernels import cached_njit
 
 _Lattice = tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]
 """Rays (n, 3) of a lattice, the same for all views, and the pixels (rows, columns) of a panorama that hold them."""

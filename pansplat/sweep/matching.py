@@ -28,8 +28,8 @@ import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.surface import pad_sphere, ray_grid
+from pansplat.system.kernels import cached_njit, parallel_for, thread_count
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
 _BATCH = 8  # hypotheses that a thread processes together

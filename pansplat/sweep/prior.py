@@ -20,7 +20,6 @@ import numpy as np
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
-from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
 from pansplat.sweep.surface import (
     list_best_pairs,
@@ -31,6 +30,7 @@ from pansplat.sweep.surface import (
     rotate_image,
     upright_rotation,
 )
+from pansplat.system.kernels import cached_njit, parallel_for, thread_count
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
 _MAX_VARIANCE = 4e-3  # largest variance of grey values that raises a weight; more texture has no more

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from pansplat.geometry.equirect import pixel_directions, rotate_equirect
-from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
+from pansplat.system.kernels import cached_njit, parallel_for, thread_count
 
 CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
 _RANGE = 1 << 14  # points that a thread processes together

@@ -16,7 +16,7 @@ import torch
 from msgspec import Meta, Struct
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.model.weights import UnsafeCheckpointError, read_checkpoint
+from pansplat.networks.weights import UnsafeCheckpointError, read_checkpoint
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import convert
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from pansplat.errors import InputError
-from pansplat.model.layers import Compat, Precision
+from pansplat.networks.layers import Compat, Precision
 from pansplat.system.options import Count, CountOrNone, Fraction, Minutes, Seed, check_numbers
 from pansplat.system.strict_json import convert, parse_json
 from pansplat.training.losses import CODE, LossWeights, PerceptualName

@@ -14,7 +14,7 @@ from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConf
 from pansplat.model.heads import AdapterConfig, AuxiliaryHeads, HeadsConfig
 from pansplat.model.network import read_weights, require_precision
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.weights import pack_weights, require_shapes, save_weights
+from pansplat.networks.weights import pack_weights, require_shapes, save_weights
 from pansplat.training.config import NetworkConfig, NetworkShape
 
 

@@ -37,7 +37,7 @@ def folder(tmp_path: Path, write_pair, sphere_predictor, monkeypatch: pytest.Mon
         def __call__(self, images, *arguments, **options):
             return super().__call__(0.7 * images, *arguments, **options)
 
-    monkeypatch.setitem(pipeline._MODELS, "default", DarkSphere)
+    monkeypatch.setitem(pipeline.models._MODELS, "default", DarkSphere)
     monkeypatch.setattr(bench, "warm_up", lambda predictor: None)
     monkeypatch.setattr(bench, "time_workload", lambda: 0.02)
     cases = [RefineCase(CROSS_FADE, HEIGHT), RefineCase("default", HEIGHT), RefineCase("default", HEIGHT, 30)]

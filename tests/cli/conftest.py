@@ -28,7 +28,7 @@ def sphere_model(monkeypatch: pytest.MonkeyPatch, sphere_predictor: type) -> typ
             levels = torch.arange(len(sphere)) % 2
             return replace(sphere, scales=torch.full_like(sphere.scales, 0.3), levels=levels)
 
-    monkeypatch.setitem(pipeline._MODELS, "sphere", Sphere)
+    monkeypatch.setitem(pipeline.models._MODELS, "sphere", Sphere)
     monkeypatch.setattr("pansplat.export.page._POSTER_SIZE", (27, 32))
     return Sphere
 

@@ -24,7 +24,7 @@ from pansplat import pipeline
 from pansplat.cli import batch, run
 from pansplat.cli.batch import REPORT_NAME, Batch, fingerprint_work, list_items, process_item
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.prediction_options import PredictOptions
 
 HEIGHT = 64
@@ -34,7 +34,7 @@ SPHERE = PredictOptions("sphere", height=HEIGHT, refine_steps=0)
 @pytest.fixture
 def sphere(sphere_predictor: type, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """`--model sphere` in this process."""
-    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    monkeypatch.setitem(pipeline.models._MODELS, "sphere", sphere_predictor)
     fingerprint_work.cache_clear()
     yield
     fingerprint_work.cache_clear()

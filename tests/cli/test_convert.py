@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pansplat.cli import run
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.weights import load_weights, pack_weights, save_weights
+from pansplat.networks.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import load
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat_viewer.scene.loader import find_entries, load_entry

@@ -64,4 +64,4 @@ def test_the_default_refinement_has_more_steps_for_joint_drawing_of_many_photogr
     for options in ([], ["--layers"], ["--refine", "3"]):
         assert run(["predict", str(room), "--model", "sphere", "-o", str(tmp_path / "x.ply"), *options]) == 0
     assert steps == [None, 0, 3]
-    assert pipeline.choose_refine_steps(8, joint=True) > pipeline.choose_refine_steps(8)
+    assert pipeline.prediction.choose_refine_steps(8, joint=True) > pipeline.prediction.choose_refine_steps(8)

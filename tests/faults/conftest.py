@@ -19,7 +19,7 @@ from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.gaussians.scene import Scene
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import pack_weights, save_weights
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.training.__main__ import run as run_training
 from pansplat_viewer import run as run_viewer
 
@@ -76,7 +76,7 @@ def folder(tmp_path: Path, originals: Path, monkeypatch: pytest.MonkeyPatch, sph
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    monkeypatch.setitem(pipeline.models._MODELS, "sphere", sphere_predictor)
     return work
 
 

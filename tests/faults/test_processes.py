@@ -82,7 +82,7 @@ class FromFile:  # compiles no kernels
         return pansplat.pipeline.load("scene.ply").gaussians
 
 
-pansplat.pipeline._MODELS["file"] = FromFile
+pansplat.pipeline.models._MODELS["file"] = FromFile
 for case in json.load(sys.stdin):
     if os.fork() == 0:
         os.environ.update(case["environment"])

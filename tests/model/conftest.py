@@ -13,7 +13,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.model.network import NetworkPredictor, build_network, convert_checkpoint
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import WeightsFile
+from pansplat.networks.weights import WeightsFile
 
 _HOOKED = (
     *("features", "features.encoder", "features.transformer", "mono_depth", "cost_volume"),
@@ -70,22 +70,6 @@ def run_official(official_weights: WeightsFile, golden: Callable[..., dict[str, 
 def error() -> Callable[[Tensor, Tensor], float]:
     """Largest difference from a golden tensor, in its standard deviations."""
     return lambda found, expected: float((found - expected).abs().max() / expected.std())
-
-
-@pytest.fixture(scope="session")
-def randomize() -> Callable[[torch.nn.Module], torch.nn.Module]:
-    """Fill a network with float64 noise, so that no layer is an identity or zero; in eval mode."""
-
-    def fill(module: torch.nn.Module) -> torch.nn.Module:
-        generator = torch.Generator().manual_seed(5)
-        module = module.double().eval()
-        with torch.no_grad():
-            for parameter in module.parameters():
-                fan_in = max(1, parameter[0].numel())
-                parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64) / fan_in**0.5)
-        return module
-
-    return fill
 
 
 @pytest.fixture(scope="session")

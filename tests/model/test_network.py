@@ -27,7 +27,7 @@ from pansplat.model.network import (
     require_precision,
 )
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
-from pansplat.model.weights import WeightsFile, pack_weights, save_weights
+from pansplat.networks.weights import WeightsFile, pack_weights, save_weights
 from pansplat.pipeline import load_model
 from pansplat.sweep.guided_sweep import default_weights
 from pansplat.system.progress import show_progress

@@ -340,7 +340,8 @@ def test_a_step_on_a_card_moves_nothing_between_card_and_memory(room, joint: boo
 @pytest.fixture
 def only_card(monkeypatch: pytest.MonkeyPatch):
     """All work is that of a pretended card."""
-    monkeypatch.setattr(pipeline, "choose_device", lambda *_, **__: CARD)
+    for part in (pipeline.prediction, pipeline.drawing):
+        monkeypatch.setattr(part, "choose_device", lambda *_, **__: CARD)
     with pretend_card() as count:
         yield count
 
@@ -364,7 +365,7 @@ def test_a_refinement_that_a_card_has_no_memory_for_is_the_processors(room, monk
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return Refinement(scene, *arguments, **options)
 
-    monkeypatch.setattr(pipeline, "Refinement", refuse)
+    monkeypatch.setattr(pipeline.prediction, "Refinement", refuse)
     with pytest.warns(InputWarning, match="refinement: the graphics card has too little memory; it runs on the proces"):
         refined = pansplat.refine(room.predicted, room.views, steps=2)
     expected = _refine(room, steps=2)[0]
@@ -382,7 +383,7 @@ def test_an_image_that_a_card_has_no_memory_for_is_the_processors(room, only_car
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return render(scene, pose, **options)
 
-    monkeypatch.setattr(pipeline, "render", draw)
+    monkeypatch.setattr(pipeline.drawing, "render", draw)
     renderer = pipeline.make_renderer(room.truth, "film", 1, size=(16, 32))
     with pytest.warns(InputWarning, match="film: the graphics card has too little memory; it runs on the processor"):
         first = renderer(pose)

@@ -10,10 +10,10 @@ from onnx_files import Node, write_onnx
 from refusals import expect_error
 
 from pansplat.evaluation.metrics import ws_psnr
-from pansplat.model.weights import pack_weights, save_weights
 from pansplat.networks.depth_network import DepthNetworkConfig
 from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load_model, load_pairs, load_predictor, predict, render
 from pansplat.prediction_options import PredictOptions
 from pansplat.sweep.guided_sweep import NetworkPrior, load_guided_sweep, save_network

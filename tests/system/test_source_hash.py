@@ -47,7 +47,7 @@ FINGERPRINTS = {
 SOURCES = {
     "sweep": ("rendering/cpu/rasterize.py", "geometry/world.py", "images/masks.py"),
     "refinement": ("rendering/reference.py", "rendering/cuda/rasterize.py", "refinement/fusion.py"),
-    "default": ("sweep/guided_sweep.py", "model/layers.py"),
+    "default": ("sweep/guided_sweep.py", "networks/layers.py"),
     "network": ("model/heads.py", "gaussians/harmonics.py", "predictor.py"),
     "pixels": ("images/image_files.py", "images/blur_masks.py", "images/cube_images.py"),
     "poses": ("poses/two_view.py", "networks/lightglue.py", "sweep/prior.py"),
@@ -64,7 +64,7 @@ def test_a_change_of_a_source_that_computes_a_result_changes_its_fingerprint(cop
 @pytest.mark.parametrize("result", FINGERPRINTS)
 def test_a_change_of_a_command_keeps_fingerprints(copied, result):
     before = FINGERPRINTS[result]()
-    for source in ("cli/render.py", "__init__.py", "pipeline.py"):
+    for source in ("cli/render.py", "__init__.py", "pipeline/prediction.py"):
         change(copied / source)
     assert FINGERPRINTS[result]() == before
 

@@ -13,8 +13,8 @@ from pansplat.inputs.views import Batch, Sample, Views, collate
 from pansplat.model.cost_volume import CostVolumeConfig, SweepLevel
 from pansplat.model.feature_pyramid import FeaturePyramidConfig, TransformerConfig
 from pansplat.model.heads import AdapterConfig, HeadsConfig
-from pansplat.model.layers import Compat
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
+from pansplat.networks.layers import Compat
 from pansplat.training import network, trainer
 from pansplat.training.config import CheckpointConfig, DataConfig, NetworkConfig, OptimizerConfig, TrainConfig
 from pansplat.training.config import ValidationConfig as Validation

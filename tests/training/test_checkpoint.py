@@ -16,7 +16,7 @@ import torch
 from refusals import expect_error
 
 from pansplat.errors import InputError
-from pansplat.model.weights import UnsafeCheckpointError, WeightsFile, save_weights
+from pansplat.networks.weights import UnsafeCheckpointError, WeightsFile, save_weights
 from pansplat.training.checkpoint import list_checkpoints, load_checkpoint, load_latest, save_checkpoint
 
 _WRITER = """

@@ -13,7 +13,7 @@ from PIL import Image
 from refusals import expect_error
 
 from pansplat.inputs.views import Batch, Sample
-from pansplat.model.weights import load_weights
+from pansplat.networks.weights import load_weights
 from pansplat.training import trainer
 from pansplat.training.config import OptimizerConfig, TrainConfig, ValidationConfig
 from pansplat.training.logs import read_table

@@ -661,7 +661,7 @@ def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
 
 def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_predictor, monkeypatch, house):
     """In the scene of a single photograph, and of two, also if it flew before the scene was there."""
-    monkeypatch.setitem(pipeline._MODELS, "sphere", sphere_predictor)
+    monkeypatch.setitem(pipeline.models._MODELS, "sphere", sphere_predictor)
     options = PredictOptions("sphere", height=64, refine_steps=0, cache=False)
     for views, farthest in (((0,), 1.8), ((0, 1), 2.6)):
         app = make_app()

@@ -34,10 +34,10 @@ from pansplat.rendering.cpu.display import (
     blend_to_pixels,
 )
 from pansplat.rendering.cpu.rasterize import MIN_TRANSMITTANCE as EXACT_TRANSMITTANCE
-from pansplat.rendering.cpu.runtime import checking_each_item, pooled_empty
 from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.system.devices import say_detail
+from pansplat.system.kernels import checking_each_item, pooled_empty
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights

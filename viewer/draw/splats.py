@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float, Int, UInt
 from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
-from pansplat.rendering.cpu.runtime import parallel_for_slices
 from pansplat.rendering.cpu.tiling import radix_argsort
+from pansplat.system.kernels import parallel_for_slices
 from pansplat_viewer.draw.color_maps import color_by_label
 from pansplat_viewer.scene.camera import Pinhole
 

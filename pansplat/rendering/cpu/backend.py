@@ -21,7 +21,6 @@ from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumu
 from pansplat.rendering.cpu.rasterize import VALUE_LANES, SavedForBackward, allocate_saved, rasterize_forward
 from pansplat.rendering.cpu.rasterize_backward import rasterize_backward
 from pansplat.rendering.cpu.records import RECORD_SIZE, PixelTables, tabulate_pixels
-from pansplat.rendering.cpu.runtime import Workspace, announce_compilation, pooled_empty, thread_count
 from pansplat.rendering.cpu.tiling import (
     LARGEST_SIDE,
     TileIntersections,
@@ -32,6 +31,7 @@ from pansplat.rendering.cpu.tiling import (
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
+from pansplat.system.kernels import Workspace, announce_compilation, pooled_empty, thread_count
 
 
 class _PlaneState(NamedTuple):

@@ -24,7 +24,6 @@ from pansplat.rendering.cpu.projection import (
 )
 from pansplat.rendering.cpu.rasterize import rasterize_forward
 from pansplat.rendering.cpu.records import BLOCK_WIDTH, TILE_SIZE, tabulate_columns
-from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for, pooled_empty
 from pansplat.rendering.cpu.simd import load_scalar, store_scalar
 from pansplat.rendering.cpu.tiling import (
     EMPTY_BOX,
@@ -35,6 +34,7 @@ from pansplat.rendering.cpu.tiling import (
 )
 from pansplat.rendering.cpu.view import CameraView
 from pansplat.rendering.image_planes import ImagePlane
+from pansplat.system.kernels import Workspace, inline_kernel, kernel, parallel_for, pooled_empty
 
 _MAX_PAIRS = 1 << 19  # pairs in a strip of columns, unless one tile's width has more: 60 MB of records and values
 _MAX_COLUMNS = 4096  # columns in a strip, whose folded image is four times as wide

@@ -21,7 +21,11 @@ from pansplat.geometry.cubemap import face_rotations
 from pansplat.rendering.blend import blend
 from pansplat.rendering.cpu.backend import rasterize_plane
 from pansplat.rendering.cpu.projection import GaussianArrays, ProjectedGaussians, project_gaussians
-from pansplat.rendering.cpu.runtime import (
+from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
+from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
+from pansplat.rendering.image_planes import ImagePlane
+from pansplat.rendering.rasterize import normalise_sums
+from pansplat.system.kernels import (
     Workspace,
     announce_compilation,
     inline_kernel,
@@ -31,10 +35,6 @@ from pansplat.rendering.cpu.runtime import (
     pooled_empty,
     thread_count,
 )
-from pansplat.rendering.cpu.simd import load_scalar, prefetch, store_scalar
-from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
-from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.rasterize import normalise_sums
 
 MIN_TRANSMITTANCE = 2.0**-10
 """A pixel of a display image is finished at this transmittance: a quarter of a step of 8 bits."""

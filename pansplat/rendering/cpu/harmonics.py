@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 
-from pansplat.rendering.cpu.runtime import inline_kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
     broadcast,
@@ -22,6 +21,7 @@ from pansplat.rendering.cpu.simd import (
     store_aos4,
     to_f32,
 )
+from pansplat.system.kernels import inline_kernel
 
 _C0 = 0.5 / math.sqrt(math.pi)
 _C1 = 0.5 * math.sqrt(3 / math.pi)

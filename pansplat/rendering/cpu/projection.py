@@ -23,7 +23,6 @@ import numpy as np
 from pansplat.constants import MAX_MAGNITUDE, MAX_SCALE_RATIO, MIN_COMPENSATION, OPACITY_CUT
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.harmonics import evaluate_basis, evaluate_colors
-from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
     PREFETCH_DISTANCE,
@@ -45,6 +44,7 @@ from pansplat.rendering.cpu.simd import (
     to_f32,
     to_f64,
 )
+from pansplat.system.kernels import Workspace, inline_kernel, kernel, parallel_for
 
 GAUSSIAN_BLOCK = 64
 GAUSSIANS_PER_ITEM = 8192

@@ -53,7 +53,6 @@ from pansplat.rendering.cpu.projection import (
     store_vector,
     whitened_axes,
 )
-from pansplat.rendering.cpu.runtime import inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.simd import (
     LANES,
     PREFETCH_DISTANCE,
@@ -74,6 +73,7 @@ from pansplat.rendering.cpu.simd import (
     store_row,
     to_f64,
 )
+from pansplat.system.kernels import inline_kernel, kernel, parallel_for
 
 _POSE_SIZE = 12  # entries of a pose: its rotation and its centre, by rows
 

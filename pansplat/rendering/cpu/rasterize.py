@@ -28,7 +28,6 @@ from pansplat.rendering.cpu.records import (
     TILE_SIZE,
     PixelTables,
 )
-from pansplat.rendering.cpu.runtime import Workspace, inline_kernel_no_refcount, kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
@@ -49,6 +48,7 @@ from pansplat.rendering.cpu.simd import (
     store_scalar,
 )
 from pansplat.rendering.cpu.tiling import parallel_for_tiles
+from pansplat.system.kernels import Workspace, inline_kernel_no_refcount, kernel
 
 Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]

@@ -47,7 +47,6 @@ from pansplat.rendering.cpu.rasterize import (
     set_tile_pixels,
 )
 from pansplat.rendering.cpu.records import RECORD_SIZE, TILE_SIZE, PixelTables
-from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel
 from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
@@ -67,6 +66,7 @@ from pansplat.rendering.cpu.simd import (
     transpose,
 )
 from pansplat.rendering.cpu.tiling import parallel_for_tiles
+from pansplat.system.kernels import inline_kernel_no_refcount, kernel
 
 _MAX_PAIRS = NUM_BLOCKS * CHUNK_SIZE  # pairs of a Gaussian and a block, in a chunk
 _PAIR_SIZE = 2 * LANES  # numbers in a pair: gradients by log alpha, and weights; one cache line

@@ -22,7 +22,9 @@ import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-from pansplat.rendering.cpu.numba_api import (
+from pansplat.rendering.cpu.records import RECORD_SIZE
+from pansplat.system.kernels import inline_kernel
+from pansplat.system.numba_api import (
     ConcreteTemplate,
     alloca_once,
     get_or_insert_function,
@@ -31,8 +33,6 @@ from pansplat.rendering.cpu.numba_api import (
     signature,
     types,
 )
-from pansplat.rendering.cpu.records import RECORD_SIZE
-from pansplat.rendering.cpu.runtime import inline_kernel
 
 LANES = 8
 PREFETCH_DISTANCE = 128  # Gaussians between a prefetch and the read
@@ -46,7 +46,7 @@ _ELEMENT = object()  # stands for the type of an array's elements
 _VECTOR_TYPES = {"f32x8": _FLOATS, "f64x8": _DOUBLES, "mask": _BITS}
 _ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes; alignment of each type's elements
 _CACHE_LINE = 64  # bytes
-_F64_FLAGS = ("contract", "nsz")  # the options of fastmath in runtime.py
+_F64_FLAGS = ("contract", "nsz")  # the options of fastmath in system/kernels.py
 
 # 2^x on [-1/2, 1/2]: least maximum relative error (9.2e-8) among polynomials of degree 5 that are 1 at 0.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472731307149)

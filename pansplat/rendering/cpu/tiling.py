@@ -22,10 +22,10 @@ from pansplat.constants import ALPHA_CUT, KAPPA_MARGIN
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.projection import CULLED, GAUSSIAN_BLOCK, GAUSSIANS_PER_ITEM, cross, dot
 from pansplat.rendering.cpu.records import BOX_BITS, TILE_SIZE
-from pansplat.rendering.cpu.runtime import Workspace, inline_kernel, kernel, parallel_for
 from pansplat.rendering.cpu.simd import load_scalar, prefetch, prefetch_for_write, records_to_soa, store_scalar
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.reference import split_rows
+from pansplat.system.kernels import Workspace, inline_kernel, kernel, parallel_for
 
 # --- bounding boxes ---
 

@@ -46,14 +46,6 @@ from pansplat.rendering.cpu.rasterize import (
     set_tile_pixels,
 )
 from pansplat.rendering.cpu.records import TILE_SIZE, tabulate_pixels
-from pansplat.rendering.cpu.runtime import (
-    Workspace,
-    announce_compilation,
-    inline_kernel_no_refcount,
-    kernel,
-    pooled_empty,
-    thread_count,
-)
 from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
@@ -77,6 +69,14 @@ from pansplat.rendering.cpu.tiling import (
 )
 from pansplat.rendering.cpu.view import make_camera
 from pansplat.rendering.image_planes import image_planes
+from pansplat.system.kernels import (
+    Workspace,
+    announce_compilation,
+    inline_kernel_no_refcount,
+    kernel,
+    pooled_empty,
+    thread_count,
+)
 
 MAX_BAND_INTERSECTIONS = 1 << 18  # intersections in a band: up to 10 million pairs, which take 0.3 GB
 MAX_STORED_PAIRS = 1 << 24  # pairs whose weights are kept, which take 0.6 GB

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pansplat.rendering.cpu.runtime import Workspace
 from pansplat.rendering.cpu.tiling import TileIntersections, radix_argsort, sort_front_to_back
+from pansplat.system.kernels import Workspace
 
 
 def _make_tiles(counts, *, slots=True):

@@ -8,7 +8,7 @@ import torch
 from pansplat.gaussians.scene import Scene
 from pansplat.model.network import build_network
 from pansplat.model.pansplat import PanSplat
-from pansplat.model.weights import load_weights
+from pansplat.networks.weights import load_weights
 from pansplat.pipeline import render
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

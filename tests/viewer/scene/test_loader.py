@@ -15,6 +15,7 @@ from refusals import expect_error
 from pansplat.errors import InputWarning
 from pansplat.gaussians.ply import save_ply
 from pansplat.geometry.world import WorldFrame
+from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
@@ -138,7 +139,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     networks = {"pairs": sphere_predictor(), "default": sphere_predictor()}
     for (name, network), least in zip(networks.items(), (2, 1), strict=True):
         network.name, network.min_views = name, least
-    monkeypatch.setattr("pansplat.pipeline.load_model", lambda name="default", **options: networks[name])
+        monkeypatch.setitem(models._MODELS, name, lambda network=network: network)
     monkeypatch.setattr("pansplat.pipeline.load_pairs", lambda path, **options: pairs)
     pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
     pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))

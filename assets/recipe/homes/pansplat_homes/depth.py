@@ -26,10 +26,10 @@ from torch.utils.data import DataLoader, Dataset
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import row_weights
 from pansplat.inputs.views import Views
-from pansplat.model.layers import to_channels_last
-from pansplat.model.weights import load_weights
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
+from pansplat.networks.layers import to_channels_last
+from pansplat.networks.weights import load_weights
 from pansplat.sweep.guided_sweep import save_network
 from pansplat.system.files import require_output_folder
 from pansplat.training.augment import mirror_views, roll_views

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tyro.conf import Positional
 
-from pansplat.model.weights import WeightsFile, save_weights
+from pansplat.networks.weights import WeightsFile, save_weights
 from pansplat.poses.learned import default_weights
 
 

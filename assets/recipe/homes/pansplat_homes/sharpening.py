@@ -17,10 +17,10 @@ from torch.nn.functional import interpolate
 
 from pansplat.geometry.equirect import resize_equirect, row_weights
 from pansplat.inputs.views import Views
-from pansplat.model.layers import to_channels_last
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.networks.depth_refinement import DepthRefinement
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
+from pansplat.networks.layers import to_channels_last
 from pansplat.sweep.guided_sweep import default_weights, load_network, save_network
 from pansplat_homes.depth import MAX_DEPTH, DepthTrainConfig, DepthTrainer, Sample, run_trainer
 from pansplat_homes.panes import close_panes

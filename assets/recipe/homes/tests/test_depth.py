@@ -9,9 +9,9 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.inputs.views import Views
-from pansplat.model.weights import pack_weights, save_weights
 from pansplat.networks.depth_network import DepthEstimate, DepthNetworkConfig
 from pansplat.networks.depth_refinement import RefinementConfig
+from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.training.checkpoint import load_latest
 from pansplat.training.logs import read_table
 from pansplat_homes import depth as training

@@ -1,8 +1,8 @@
-"""All that the CPU kernels use of numba beyond its documented interface, in one place.
+"""All that kernels use of numba beyond its documented interface, in one place.
 
-It exists in numba 0.60 to 0.68; tests/rendering/cpu/test_numba_api.py names what a later version lacks. Without what is
-found by `_find` the kernels give the same results, but are compiled in every process, in more versions, or not inlined.
-The imports are required: simd.py defines its vectors with them.
+It exists in numba 0.60 to 0.68, the versions that pyproject.toml allows; tests/system/test_numba_api.py names what a
+later version lacks. Without what is found by `_find` the kernels give the same results, but are compiled in every
+process, in more versions, or not inlined. The imports are required: `pansplat.rendering.cpu.simd` needs them.
 """
 
 import contextlib

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.rendering.cpu import runtime
-from pansplat.rendering.cpu.runtime import (
+from pansplat.system import kernels, source_hash
+from pansplat.system.kernels import (
     Workspace,
     announce_compilation,
     cached_njit,
@@ -20,7 +20,6 @@ from pansplat.rendering.cpu.runtime import (
     pooled_empty,
     release_idle_memory,
 )
-from pansplat.system import source_hash
 
 
 def _add_indices(x):
@@ -46,12 +45,12 @@ class _Timer:
 @pytest.fixture
 def count_messages(monkeypatch, capsys, tmp_path):
     """A function that compiles two kernels as in a new process, and counts the messages."""
-    monkeypatch.setattr(runtime, "_cache_folder", tmp_path)
+    monkeypatch.setattr(kernels, "_cache_folder", tmp_path)
     monkeypatch.setattr(threading, "Timer", _Timer)
 
     def run(delay, module):
-        monkeypatch.setattr(runtime, "_MESSAGE_DELAY", delay)
-        monkeypatch.setattr(runtime, "_message_shown", False)
+        monkeypatch.setattr(kernels, "_MESSAGE_DELAY", delay)
+        monkeypatch.setattr(kernels, "_message_shown", False)
         with announce_compilation():
             for _ in range(2):
                 _compile_as_part_of(module)
@@ -76,12 +75,12 @@ def test_long_compilation_of_pansplat_kernels_is_announced_once(delay, module, m
 def test_later_processes_do_not_announce_it_again_until_the_kernels_change(count_messages, monkeypatch, tmp_path):
     module = "pansplat.rendering.cpu.projection"
     assert [count_messages(0.0, module) for _ in range(2)] == [1, 0]
-    monkeypatch.setattr(runtime.nb, "__version__", "another one")
+    monkeypatch.setattr(kernels.nb, "__version__", "another one")
     assert count_messages(0.0, module) == 1
 
 
 def test_without_a_writable_cache_every_process_announces_it(count_messages, monkeypatch, tmp_path):
-    monkeypatch.setattr(runtime, "_cache_folder", tmp_path / "missing")
+    monkeypatch.setattr(kernels, "_cache_folder", tmp_path / "missing")
     assert [count_messages(0.0, "pansplat.rendering.cpu.projection") for _ in range(2)] == [1, 1]
 
 
@@ -90,7 +89,7 @@ def test_a_change_of_an_imported_module_invalidates_a_kernel(decorate, monkeypat
     """`lift` inlines functions of `surface`; numba itself checks the file of the kernel only."""
     stamps = []
     monkeypatch.setattr(source_hash, "_FOLDER", tmp_path)
-    monkeypatch.setattr(runtime, "set_source_stamp", lambda compiled, stamp: not stamps.append(stamp))
+    monkeypatch.setattr(kernels, "set_source_stamp", lambda compiled, stamp: not stamps.append(stamp))
     (tmp_path / "sweep").mkdir()
     (tmp_path / "sweep/lift.py").write_text("from pansplat.sweep.surface import locate\n")
     function = type(_add_indices)(_add_indices.__code__, {"range": range})
@@ -109,7 +108,7 @@ def test_a_kernel_is_compiled_without_a_cache_directory(monkeypatch):
             raise RuntimeError("cannot cache function: no locator available")
         return nb.njit(**options)
 
-    monkeypatch.setattr(runtime, "nb", type("Numba", (), {"njit": staticmethod(refuse)}))
+    monkeypatch.setattr(kernels, "nb", type("Numba", (), {"njit": staticmethod(refuse)}))
     assert kernel(_add_indices)(1.0) == 4.0
 
 
@@ -156,8 +155,8 @@ def test_two_threads_may_use_parallel_for_at_once():
 
 @pytest.fixture
 def no_idle_memory(monkeypatch):
-    monkeypatch.setattr(runtime, "_idle", [])
-    monkeypatch.setattr(runtime, "_returned", deque())
+    monkeypatch.setattr(kernels, "_idle", [])
+    monkeypatch.setattr(kernels, "_returned", deque())
 
 
 def _used_address(shape, dtype):
@@ -184,12 +183,12 @@ def test_arrays_are_contiguous_and_aligned_to_a_cache_line(shape):
 
 @pytest.mark.usefixtures("no_idle_memory")
 def test_idle_memory_is_limited(monkeypatch):
-    monkeypatch.setattr(runtime, "_MAX_IDLE", 5000)
+    monkeypatch.setattr(kernels, "_MAX_IDLE", 5000)
     workspace = Workspace()
     for _ in range(10):
         workspace.array(1000, np.uint8)
     del workspace
-    assert 0 < sum(buffer.nbytes for buffer in runtime._idle) <= 5000
+    assert 0 < sum(buffer.nbytes for buffer in kernels._idle) <= 5000
 
 
 @pytest.mark.usefixtures("no_idle_memory")
@@ -210,8 +209,8 @@ def test_pooled_memory_is_reused_after_the_last_view_of_it():
 def test_a_workspace_that_ends_while_the_lock_is_held_does_not_wait():
     workspace = Workspace()
     address = workspace.array(5000, np.uint8).ctypes.data
-    with runtime._lock:
+    with kernels._lock:
         del workspace
         gc.collect()
-        assert runtime._idle == []
+        assert kernels._idle == []
     assert _used_address(5000, np.uint8) == address

@@ -6,8 +6,8 @@ import numba
 import numpy as np
 import pytest
 
-from pansplat.rendering.cpu import numba_api, runtime
-from pansplat.rendering.cpu.runtime import announce_compilation, inline_kernel, kernel
+from pansplat.system import kernels, numba_api
+from pansplat.system.kernels import announce_compilation, inline_kernel, kernel
 
 _OF_NUMBA = (
     "core.event.install_listener",
@@ -25,7 +25,7 @@ def test_numba_has_the_private_interface_that_the_kernels_use():
     missing += [f"{type(cached).__name__}.{path}" for path in _OF_KERNELS if numba_api._find(cached, path) is None]
     assert not missing, (
         f"numba {numba.__version__} has no {', '.join(missing)}: the CPU kernels are slower to start without; find "
-        "what replaces it in pansplat/rendering/cpu/numba_api.py, and state the versions there"
+        "what replaces it in pansplat/system/numba_api.py, and state the versions there and in pyproject.toml"
     )
 
 
@@ -53,5 +53,5 @@ def test_without_a_private_name_kernels_give_the_same_results(hidden, tmp_path, 
 
 def test_a_kernel_that_cannot_be_stamped_is_not_cached(monkeypatch):
     assert numba_api._find(kernel(_add), "_cache._cache_file") is not None
-    monkeypatch.setattr(runtime, "set_source_stamp", lambda compiled, stamp: False)
+    monkeypatch.setattr(kernels, "set_source_stamp", lambda compiled, stamp: False)
     assert numba_api._find(kernel(_add), "_cache._cache_file") is None

@@ -1,4 +1,4 @@
-"""Compilation by numba, worker threads, and reused working memory for the CPU kernels.
+"""Compilation by numba, worker threads, and reused working memory for kernels on the processor.
 
 Numba caches compiled code on disk, so each kernel is compiled once per machine.
 """
@@ -13,6 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pansplat.rendering.cpu.numba_api import (
+from pansplat.system.numba_api import (
     find_cache_folder,
     known_options,
     notify_of_compilation,
@@ -30,8 +31,8 @@ from pansplat.rendering.cpu.numba_api import (
 )
 from pansplat.system.source_hash import hash_sources
 
-_PACKAGE = __name__.rpartition(".")[0]
-_INLINED = _PACKAGE, "pansplat.constants"  # modules whose functions and constants become part of kernels
+# Modules that are a part of all kernels, besides those of the package of a kernel.
+_INLINED = __name__, "pansplat.system.numba_api", "pansplat.constants"
 
 # --- compilation ---
 
@@ -67,7 +68,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
         # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
-        stamp = hash_sources(function.__module__, (*_INLINED, function.__module__.rpartition(".")[0]))
+        stamp = hash_sources(function.__module__, (*_INLINED, _find_package(function.__module__)))
         with contextlib.suppress(RuntimeError):  # no writable cache directory
             compiled = nb.njit(cache=True, **options)(function)
             if set_source_stamp(compiled, stamp):
@@ -75,6 +76,10 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return nb.njit(**options)(function)
 
     return decorate
+
+
+def _find_package(module: str) -> str:
+    return module.rpartition(".")[0]
 
 
 def inline_kernel(function: Callable[..., Any]) -> Any:
@@ -106,8 +111,8 @@ def announce_compilation() -> Iterator[None]:
 
     def start(module: str) -> None:
         nonlocal timer, collection_paused
-        if timer is None and module.startswith(_PACKAGE):
-            timer = threading.Timer(_MESSAGE_DELAY, _show_message)
+        if timer is None and module.startswith("pansplat."):
+            timer = threading.Timer(_MESSAGE_DELAY, partial(_show_message, _find_package(module)))
             timer.daemon = True
             timer.start()
             collection_paused = gc.isenabled()
@@ -123,12 +128,12 @@ def announce_compilation() -> Iterator[None]:
             gc.enable()
 
 
-def _show_message() -> None:
-    """Print the message once per process, and once per cache of kernels, which commands fill one after the other."""
+def _show_message(package: str) -> None:
+    """Print the message once per process, and once per cache of a package's kernels, which several commands fill."""
     global _message_shown
     if not _message_shown:
         _message_shown = True
-        if _cache_folder is None or _mark(_cache_folder):
+        if _cache_folder is None or _mark(_cache_folder, package):
             print(_MESSAGE, file=sys.stderr, flush=True)
 
 
@@ -138,10 +143,10 @@ def hide_message() -> None:
     _message_shown = True
 
 
-def _mark(folder: Path) -> bool:
-    """Leave a mark of this version of the kernels in their cache; whether there was none."""
+def _mark(folder: Path, package: str) -> bool:
+    """Leave a mark of this version of a package's kernels in their cache; whether there was none."""
     try:
-        (folder / f"announced-{nb.__version__}-{hash_sources(_PACKAGE, _INLINED)}").touch(exist_ok=False)
+        (folder / f"announced-{nb.__version__}-{hash_sources(package, (*_INLINED, package))}").touch(exist_ok=False)
     except FileExistsError:
         return False
     except OSError:

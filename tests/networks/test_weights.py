@@ -1,4 +1,4 @@
-"""Weights on disk: round trips, refusals, checkpoints with code, and the conversion of official names."""
+"""Weights on disk: round trips, refusals, checkpoints with code."""
 
 import dataclasses
 import os
@@ -14,14 +14,12 @@ from refusals import expect_error
 from torch import Tensor
 
 from pansplat.errors import InputError
-from pansplat.model.weights import (
+from pansplat.networks.weights import (
     UnsafeCheckpointError,
     WeightsFile,
     config_from_dict,
-    convert_tensors,
     get_state_dict,
     load_weights,
-    match_tensors,
     read_checkpoint,
     require_shapes,
     save_weights,
@@ -153,70 +151,6 @@ def test_a_checkpoint_without_tensors_by_name_is_refused(tmp_path: Path) -> None
     expect_error("needed a checkpoint with a `state_dict`, got a Tensor", read_checkpoint, path)
     expect_error("got one with model, epoch", get_state_dict, {"model": {}, "epoch": 1}, path)
     expect_error("other values at b", lambda: get_state_dict({"state_dict": {"a": torch.rand(1), "b": 3}}, path))
-
-
-# Official names
-
-
-def list_names(shared: Path, keys: str) -> list[str]:
-    lines = (shared / "golden" / f"state_dict_{keys}.tsv").read_text().splitlines()
-    return [line.split("\t")[0] for line in lines if line and not line.startswith("#")]
-
-
-def make_tensors(shared: Path, keys: str) -> dict[str, Tensor]:
-    return {name.removeprefix("encoder."): torch.zeros(1) for name in list_names(shared, keys)}
-
-
-def test_tensors_that_are_left_out_are_listed_by_reason(shared: Path, as_lightning: Wrap) -> None:
-    content = as_lightning(make_tensors(shared, "pansplat-512"))
-    auxiliary = list_names(shared, "pansplat-512-360loc_aux")
-    content["state_dict"] |= {name: torch.zeros(1) for name in auxiliary}
-    left = {reason: len(names) for reason, names in match_tensors(content, "360loc").items()}
-    assert left == {"recomputed grids": 5, "auxiliary heads, for training only": 18, "training state": 5}
-
-
-def test_missing_and_surplus_tensors_are_named_and_counted(shared: Path, as_lightning: Wrap) -> None:
-    content = as_lightning(make_tensors(shared, "pansplat-512"))
-    state = content["state_dict"]
-    removed = [name for name in state if "q_proj" in name]
-    for name in removed:
-        del state[name]
-    state["encoder.new.weight"] = state["losses.2.gaussian_head.new"] = torch.zeros(1)
-    with pytest.raises(InputError) as caught:
-        match_tensors(content, "odd.ckpt")
-    message = str(caught.value)
-    assert message.startswith("odd.ckpt: needed exactly the tensors of the official PanSplat, lacked 12 (")
-    assert min(removed) in message and ", ...)" in message
-    assert "found unknown 2 (encoder.new.weight, losses.2.gaussian_head.new)" in message
-
-
-def test_checkpoints_of_other_models_are_refused(as_lightning: Wrap) -> None:
-    expect_error(r"1 \(encoder.fc\)", lambda: match_tensors(as_lightning({"fc": torch.zeros(1)}), "x"))
-    with pytest.raises(InputError, match="MVSplat baseline"):
-        match_tensors(as_lightning({"backbone.backbone.conv1.weight": torch.zeros(1)}), "x")
-    expect_error("got tensors none", lambda: match_tensors(as_lightning({}), "x"))
-
-
-def test_a_changed_grid_is_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    name = "mono_depth.c2e.2.sample_grid"
-    with pytest.raises(InputError, match=f"the official grid in {name}"):
-        convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name].flip(2)}), "x")
-    with pytest.raises(InputError, match=f"the official grid in {name}"):
-        convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name][:, :, :4]}), "x")
-
-
-def test_values_that_are_not_finite_are_refused(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    name = "backbone.decoder.inner1.bias"
-    broken = recipe_weights[name].clone()
-    broken[3] = torch.nan
-    with pytest.raises(InputError, match=f"got NaN or infinity in {name}"):
-        convert_tensors(as_lightning(recipe_weights | {name: broken}), "x")
-
-
-def test_half_precision_weights_become_float32(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:
-    name = "gaussian_head.gaussians_mlp_list.0.0.bias"
-    tensors = convert_tensors(as_lightning(recipe_weights | {name: recipe_weights[name].half()}), "x")
-    assert {tensor.dtype for tensor in tensors.values()} == {torch.float32, torch.int64}
 
 
 def test_wrong_shapes_are_named() -> None:

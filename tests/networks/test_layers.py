@@ -6,7 +6,7 @@ import pytest
 import torch
 from refusals import expect_error
 
-from pansplat.model.layers import (
+from pansplat.networks.layers import (
     PanoramaConv2d,
     attend,
     autocast_convolutions,
