@@ -77,8 +77,9 @@ class _FloorPlan:
         """Write the plan and print its rooms."""
         from pansplat.export.plan_files import describe_plan, write_plan
 
-        scene, _ = export.open()
-        print(f"{export.out}: {'; '.join(describe_plan(write_plan(scene, export.out)))}")
+        scene, photographs = export.open()
+        plan = write_plan(scene, export.out, photographs[0].folder if photographs else None)
+        print(f"{export.out}: {'; '.join(describe_plan(plan))}")
 
 
 @dataclass(frozen=True)

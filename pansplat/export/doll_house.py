@@ -194,15 +194,12 @@ def _raise_walls(
 
 
 @torch.no_grad()
-def make_house(
-    scene: Scene, rooms: Rooms, level: Float[np.ndarray, "3 3"], photographs: Sequence[Pair] = ()
-) -> DollHouse:
+def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[Pair] = ()) -> DollHouse:
     """The doll's houses of a scene.
 
     Args:
         scene: with input cameras.
         rooms: of the scene.
-        level: right, down and forward (columns) of normals.
         photographs: of each view; without them the images of the Gaussians.
     """
     if not rooms.houses:
@@ -212,7 +209,7 @@ def make_house(
     density, places = _pack(panels, _FINEST / float(np.median(rooms.floors)))
     atlas = np.zeros((_ATLAS, _ATLAS, 3), np.uint8)
     shown = {host: list[np.ndarray]() for host in sorted(set(rooms.hosts))}
-    turn, textures = rooms.level[:, (0, 2)].T @ level[:, (0, 2)], []
+    textures = []
     for panel, place in zip(panels, places, strict=True):
         flat = _triangulate(panel.shape)
         if panel.facing is None:
@@ -220,7 +217,7 @@ def make_house(
             uv = (place + _MARGIN + density * flat) / _ATLAS
         else:
             along = rooms.show(panel.house, np.array(((0.0, 0.0, 0.0), np.insert(panel.facing, 1, 0.0))))
-            uv = np.broadcast_to(2 + (along[1] - along[0])[[0, 2]] @ turn, flat.shape)
+            uv = np.broadcast_to(2 + (along[1] - along[0])[[0, 2]], flat.shape)
         world = rooms.show(panel.house, panel.locate(flat)) @ rooms.level.T
         shown[rooms.hosts[panel.house]].append(np.concatenate((world, uv), axis=1))
     for panel, place, color, seen in textures:

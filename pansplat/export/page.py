@@ -37,7 +37,7 @@ from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, c
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_files, pack_photographs
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
-from pansplat.geometry.path import find_direction, path_poses, turn_pose
+from pansplat.geometry.path import find_direction, turn_pose
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
@@ -151,7 +151,6 @@ def write_page(
     facts = TourFacts(
         scene if has_cameras else prepared,
         folder=photographs[0].folder if photographs else None,
-        level=None if scene.overlaps else path_poses(prepared.cam2world)[0, :3, :3].numpy(),
     )
     tour = dataclasses.replace(facts.tour, poor=facts.poor)
     rooms = find_rooms(facts) if has_cameras else None
@@ -160,7 +159,7 @@ def write_page(
     house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
-        house = make_house(scene, rooms, flights.level, photographs if has_pictures else ())
+        house = make_house(scene, rooms, photographs if has_pictures else ())
     heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
     flown = _find_flown_parts(flights, tour.poor) if has_pictures else {*flights.parts}
     views = [view for view, part in enumerate(flights.parts) if part in flown]
@@ -185,7 +184,7 @@ def write_page(
     report_progress("writing", 0.95)
     header = _describe_scene(prepared, packed, origin, flights, tour, facts, flown)
     header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
-    header["plan"] = _describe_plan(facts, flights.level) if has_cameras else _NO_PLAN
+    header["plan"] = _describe_plan(facts) if has_cameras else _NO_PLAN
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
         spot["notes"] = [
             {
@@ -242,7 +241,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
     """
     views = tuple(range(len(scene.cam2world)))
     walk = tuple(dict.fromkeys(tour.plan_walk())) if tour.overlaps else views
-    start, level = scene.cam2world[walk[0]].clone(), facts.level
+    start, level = scene.cam2world[walk[0]].clone(), tour.level_axes
     start[:3, :3] = torch.from_numpy(level)
     yaw, pitch = _find_ahead(tour, facts, walk[0])
     start = _look(start, level, yaw, pitch)
@@ -267,7 +266,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
     """Yaw and pitch of the start view of a panorama, else of its widest view."""
     start = tour.find_start_view(view)
-    return (find_widest(facts.outlooks[view]), 0.0) if start is None else find_angles(facts.level.T @ start)
+    return (find_widest(facts.outlooks[view]), 0.0) if start is None else find_angles(tour.level_axes.T @ start)
 
 
 def _order_views(scene: Scene, flights: _Flights) -> list[int]:
@@ -466,15 +465,9 @@ def _describe_scene(
     }
 
 
-def _describe_plan(facts: TourFacts, level: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
-    """The floor plan: its drawing, and where the panoramas are on it.
-
-    Args:
-        level: axes that yaws of the page are relative to.
-    """
-    svg, size, marks = draw_page_plan(facts.plan)
-    right, forward = facts.tour.level_axes[:, (0, 2)].T @ level[:, 2]
-    places = [(x, y, None if turn is None else turn + math.atan2(right, forward)) for x, y, turn in marks]
+def _describe_plan(facts: TourFacts) -> dict[str, Any]:
+    """The floor plan: its drawing, and where the panoramas are on it."""
+    svg, size, places = draw_page_plan(facts.plan)
     rooms = [room.panoramas for room in facts.plan.rooms]
     return {
         "worlds": facts.tour.worlds,

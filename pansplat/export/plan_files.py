@@ -65,19 +65,20 @@ class _Text:
         return affinity.translate(affinity.rotate(box, self.angle), *self.place)
 
 
-def write_plan(scene: Scene, path: str | Path) -> Plan:
+def write_plan(scene: Scene, path: str | Path, folder: Path | None = None) -> Plan:
     """Write the floor plan of a scene with straight walls, and return it.
 
     Args:
         scene: with input cameras, not fused.
         path: a .svg or .png.
+        folder: of the panoramas, in which the plan is stored; None keeps nothing.
     """
     if scene.joint:
         raise InputError(
             f"cannot write {path}: needed all that each panorama shows, got a scene with each surface once; give the "
             "folder of the panoramas, or a scene that was exported with --layers"
         )
-    facts = TourFacts(scene)
+    facts = TourFacts(scene, folder=folder)
     plan = facts.plan if len(facts.tour) else None
     if plan is None or not plan.num_heights:
         raise InputError(

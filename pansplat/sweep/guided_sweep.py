@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TypeVar
@@ -54,11 +54,12 @@ def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | s
         depth_network: an ONNX file whose network replaces the sharpening network (`networks.relative_depth`).
     """
     files_of_weights = path, _shipped("sharpening.safetensors")
-    networks = load_network(files_of_weights[0], DepthRefinement), load_network(files_of_weights[1], DepthSharpening)
     relative = None if depth_network is None else load_relative_depth(depth_network)
     digest = hashlib.blake2b(b"".join(file.read_bytes() for file in files_of_weights), digest_size=8)
     fingerprint = digest.hexdigest() + hash_sources(__name__) + ("" if relative is None else relative.fingerprint)
-    prior = NetworkPrior(*networks, fingerprint, relative=relative)
+    prior = NetworkPrior(partial(_load_networks, *files_of_weights), fingerprint, relative=relative)
+    if path != default_weights():
+        _ = prior.networks  # other files are refused before the work begins
     # A user's network has better shapes than ours, whose scale errs so that the whole range of depth is searched.
     return Sweep(SearchConfig(_SEARCH_HEIGHT, near_single_views=relative is not None), prior, name)
 
@@ -67,6 +68,10 @@ def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | s
 def load_default_sweep() -> Sweep:
     """The guided sweep of the weights that the package ships; it is loaded once."""
     return load_guided_sweep(default_weights())
+
+
+def _load_networks(path: Path, sharpening: Path) -> tuple[DepthRefinement, DepthSharpening]:
+    return load_network(path, DepthRefinement), load_network(sharpening, DepthSharpening)
 
 
 Network = TypeVar("Network", DepthRefinement, DepthSharpening)
@@ -114,8 +119,7 @@ class NetworkPrior:
     """A `PriorModel` of a depth network.
 
     Args:
-        network: in eval mode.
-        sharpening: in eval mode.
+        load: reads the two networks, in eval mode, when they are needed first.
         fingerprint: changes with the weights.
         height: height of the panoramas that the depth network sees, pixels.
         relative: replaces the sharpening network.
@@ -123,20 +127,23 @@ class NetworkPrior:
 
     def __init__(
         self,
-        network: DepthRefinement,
-        sharpening: DepthSharpening,
+        load: Callable[[], tuple[DepthRefinement, DepthSharpening]],
         fingerprint: str,
         height: int = 128,
         relative: RelativeDepthNetwork | None = None,
     ) -> None:
-        self.network, self.sharpening, self.fingerprint, self.height = network, sharpening, fingerprint, height
-        self.relative = relative
+        self._load, self.fingerprint, self.height, self.relative = load, fingerprint, height, relative
+
+    @cached_property
+    def networks(self) -> tuple[DepthRefinement, DepthSharpening]:
+        """The network, and the one that sharpens its estimate."""
+        return self._load()
 
     @torch.no_grad()
     def observe(self, images: Sequence[np.ndarray]) -> NetworkObservation:
         """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
         device = choose_device("depth networks", len(images) * _PANORAMA_SECONDS)
-        network, sharpening = self.network, self.sharpening
+        network, sharpening = self.networks
         if device.type != "cpu":  # other threads use these networks, too, so they are copied
             network, sharpening = (copy.deepcopy(each).to(device) for each in (network, sharpening))
         maps = torch.stack([torch.from_numpy(image).permute(2, 0, 1) for image in images]).float()

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from shapely.geometry import Polygon
 
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys, choose_camera_height, find_ceiling
+from pansplat.tours.floor import assign_storeys, choose_camera_height
 from pansplat.tours.plan import Plan
-from pansplat.tours.surfaces import sample_surfaces
 
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
 
@@ -59,12 +56,7 @@ class Rooms:
 
 def find_rooms(facts: TourFacts) -> Rooms:
     """The rooms of a scene of all panoramas: those of the floor plan."""
-    tour, scene, plan, gaussians = facts.tour, facts.scene, facts.plan, facts.scene.gaussians.to(device="cpu")
-    level, count = tour.level_axes, len(tour)
-    gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
-    scene = dataclasses.replace(scene, gaussians=gaussians)
-    unit = choose_camera_height(facts.heights, scene.far)
-    ceilings = [find_ceiling(sample_surfaces(scene, view, level)) for view in range(count)]
+    tour, plan, unit = facts.tour, facts.plan, choose_camera_height(facts.heights, facts.tour.far)
     outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
     enclosed = {view for room in plan.rooms if room.is_closed for view in room.panoramas}
@@ -75,10 +67,10 @@ def find_rooms(facts: TourFacts) -> Rooms:
         if sum(room.is_closed and room.panoramas[0] in views for room in plan.rooms) >= max(missing, 1):
             houses.append(views)
     return Rooms(
-        level,
+        tour.level_axes,
         tour.positions,
         np.array([height or unit for height in facts.heights]),
-        np.array([ceiling or _USUAL_CEILING * unit for ceiling in ceilings]),
+        np.array([ceiling or _USUAL_CEILING * unit for ceiling in facts.ceilings]),
         tuple(outlines),
         tuple(houses),
         plan,

@@ -8,14 +8,13 @@ docs/web.md has the calibration, an edge a row, on real and generated homes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions, row_weights
-from pansplat.tours.surfaces import OPAQUE, find_colors, locate_ends
+from pansplat.tours.surfaces import Surfaces
 
 POOR = 0.16  # largest share of a good flight's pictures that shows things twice; by the eye (docs/web.md)
 _ROWS = 64  # of the panoramas of points
@@ -30,46 +29,44 @@ _DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wal
 _Points = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]  # places and colours
 
 
-def find_walls(scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+def find_walls(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     """The edges that lead through a wall or a closed door: each camera sees a surface in front of the other camera.
 
     Args:
-        scene, panoramas, edges: see `judge_edges`.
+        surfaces, edges: see `judge_edges`.
     """
-    inside, surfaces, centers = locate_ends(scene, panoramas, edges)
 
     def is_blocked(node: int, other: int) -> bool:
-        way = centers[other] - centers[node]
-        distances, length = np.linalg.norm(surfaces[node], axis=1), float(np.linalg.norm(way))
-        ahead = distances[surfaces[node] @ way > _COSINE * distances * length]
+        way, distances = surfaces[other].center - surfaces[node].center, surfaces[node].distances
+        length = float(np.linalg.norm(way))
+        ahead = distances[surfaces[node].opaque @ way > _COSINE * distances * length]
         return len(ahead) > 0 and bool(np.quantile(ahead, _SHARE) < _DEPTH * length)
 
-    return [(a, b) for a, b in inside if is_blocked(a, b) and is_blocked(b, a)]
+    return [(a, b) for a, b in _list_inside(surfaces, edges) if is_blocked(a, b) and is_blocked(b, a)]
 
 
-def find_poor_edges(
-    scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]
-) -> tuple[tuple[int, int], ...]:
+def find_poor_edges(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
     """The edges of `judge_edges` whose flights would be poor."""
-    return tuple(edge for edge, error in judge_edges(scene, panoramas, edges).items() if error > POOR)
+    return tuple(edge for edge, error in judge_edges(surfaces, edges).items() if error > POOR)
 
 
-def judge_edges(
-    scene: Scene, panoramas: Sequence[int], edges: Iterable[tuple[int, int]]
-) -> dict[tuple[int, int], float]:
+def judge_edges(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]]) -> dict[tuple[int, int], float]:
     """The share of the pictures of a flight that shows things twice, of each edge in its worse direction.
 
     Args:
-        scene: of some panoramas, with all Gaussians of each.
-        panoramas: the number in the tour of each of the scene's views.
+        surfaces: that some panoramas show.
         edges: pairs of panoramas; those with another panorama are left out.
     """
-    inside, surfaces, centers = locate_ends(scene, panoramas, edges)
-    colors = {node: find_colors(scene, panoramas.index(node), min_opacity=OPAQUE) for node in surfaces}
-    return {
-        (a, b): measure_doubled((surfaces[a], colors[a]), (surfaces[b], colors[b]), centers[b] - centers[a])
-        for a, b in inside
+    inside = _list_inside(surfaces, edges)
+    points = {
+        node: (surfaces[node].opaque, surfaces[node].colors) for node in {node for edge in inside for node in edge}
     }
+    return {(a, b): measure_doubled(points[a], points[b], surfaces[b].center - surfaces[a].center) for a, b in inside}
+
+
+def _list_inside(nodes: Container[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The edges between two of some panoramas."""
+    return [(a, b) for a, b in edges if a != b and a in nodes and b in nodes]
 
 
 def measure_doubled(first: _Points, second: _Points, way: Float[np.ndarray, "3"]) -> float:

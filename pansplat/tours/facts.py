@@ -17,11 +17,11 @@ from pansplat.gaussians.scene import Scene
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 from pansplat.tours.edges import find_poor_edges, find_walls
-from pansplat.tours.floor import FloorOutline, choose_camera_height, find_camera_height, find_floor_outline
+from pansplat.tours.floor import FloorOutline, choose_camera_height, find_ceiling, find_floor, find_floor_outline
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers, make_graph
 from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
 from pansplat.tours.plan import Door, Plan, Room, make_plan
-from pansplat.tours.surfaces import OPAQUE, locate_surfaces
+from pansplat.tours.surfaces import Surfaces, find_surfaces
 
 Value = TypeVar("Value")
 
@@ -44,7 +44,6 @@ class TourFacts:
         scene: of some panoramas of the tour, in its world, with all Gaussians of each.
         tour: the graph.
         views: the number in the tour of each of the scene's views.
-        level: axes of a level camera (columns right, down, forward) that `outlooks` and `clearances` are relative to.
     """
 
     def __init__(
@@ -54,7 +53,6 @@ class TourFacts:
         views: ViewNumbers | None = None,
         *,
         folder: Path | None = None,
-        level: Float[np.ndarray, "3 3"] | None = None,
     ) -> None:
         """Compute nothing yet.
 
@@ -63,23 +61,22 @@ class TourFacts:
             tour: by default that of the scene's cameras.
             views: by default all panoramas.
             folder: of the panoramas, in which the parts are stored; None keeps none.
-            level: by default `TourGraph.level_axes`.
         """
         self.scene = scene
         self.tour = make_graph(scene) if tour is None else tour
         self.views = tuple(range(len(self.tour))) if views is None else views
-        self._level = level
         self._store = None if folder is None else Store(folder, (FloorOutline, Room, Door))
 
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
         _ = self.outlines, self.outlooks, self.clearances, self.hidden, self.walls, self.poor
+        vars(self).pop("surfaces", None)  # much memory
         return self
 
-    @property
-    def level(self) -> Float[np.ndarray, "3 3"]:
-        """See the class."""
-        return self.tour.level_axes if self._level is None else self._level
+    @cached_property
+    def surfaces(self) -> dict[int, Surfaces]:
+        """What each view shows, by panorama, in the level axes of the tour."""
+        return dict(zip(self.views, find_surfaces(self.scene, self.tour.level_axes), strict=True))
 
     @cached_property
     def _key(self) -> str:
@@ -92,25 +89,29 @@ class TourFacts:
             hash_sources(__name__),
             json.dumps([self.views, edges, tour.worlds, names, self.scene.joint]),
             tour.cam2world.numpy(),
-            self.level,
             *(array.detach().cpu().numpy() for array in arrays),
         )
 
     @_stored
     def heights(self) -> list[float | None]:
         """Heights of the cameras over the floor, metres; None where a view shows no floor."""
-        return [find_camera_height(self.scene, view, self.tour.level_axes) for view in range(len(self.views))]
+        return [find_floor(own.samples) for own in self.surfaces.values()]
+
+    @_stored
+    def ceilings(self) -> list[float | None]:
+        """Heights of the ceilings over the cameras, metres; None where a view shows none."""
+        return [find_ceiling(own.samples) for own in self.surfaces.values()]
 
     @cached_property
     def usual_heights(self) -> list[float]:
         """The heights of all cameras of the tour, metres; the median of those that are known for the others."""
         known = dict(zip(self.views, self.heights, strict=True))
-        usual = choose_camera_height(self.heights, self.scene.far)
+        usual = choose_camera_height(self.heights, self.tour.far)
         return [known.get(node) or usual for node in range(len(self.tour))]
 
     @_stored
     def _floors(self) -> list[FloorOutline | None]:
-        return [find_floor_outline(self.scene, view, self.tour.level_axes) for view in range(len(self.views))]
+        return [find_floor_outline(own) for own in self.surfaces.values()]
 
     @cached_property
     def outlines(self) -> dict[int, FloorOutline]:
@@ -121,12 +122,12 @@ class TourFacts:
     @_stored
     def outlooks(self) -> Float[np.ndarray, "view bin"]:
         """Distances around the horizon (`measure_outlook`)."""
-        return np.stack([measure_outlook(self.scene, k, self.level) for k in range(len(self.views))])
+        return np.stack([measure_outlook(own) for own in self.surfaces.values()])
 
     @_stored
     def clearances(self) -> Float[np.ndarray, "view row bin"]:
         """Distances of the nearest surfaces around the cameras (`measure_clearance`)."""
-        return np.stack([measure_clearance(self.scene, k, self.level) for k in range(len(self.views))])
+        return np.stack([measure_clearance(own) for own in self.surfaces.values()])
 
     @cached_property
     def bounds(self) -> TourGraph:
@@ -138,22 +139,22 @@ class TourFacts:
     @_stored
     def hidden(self) -> list[list[int]]:
         """For each view, the panoramas whose places on the floor surfaces hide (`find_hidden`)."""
-        marks, hidden = self.tour.positions + np.outer(self.usual_heights, self.level[:, 1]), []
-        for view, node in enumerate(self.views):
-            places = locate_surfaces(self.scene, view, self.level, min_opacity=OPAQUE)
-            found = find_hidden(places, (marks - self.tour.positions[node]) @ self.level)
+        marks, hidden = self.tour.positions @ self.tour.level_axes, []
+        marks[:, 1] += self.usual_heights
+        for node, own in self.surfaces.items():
+            found = find_hidden(own, marks - own.center)
             hidden.append([other for other in found if other != node])
         return hidden
 
     @_stored
     def walls(self) -> list[Edge]:
         """The edges that the scene shows to be none (`find_walls`); a scene of `merge_scenes` has no others."""
-        return [] if self.scene.overlaps else find_walls(self.scene, self.views, self.tour.overlaps)
+        return [] if self.scene.overlaps else find_walls(self.surfaces, self.tour.overlaps)
 
     @_stored
     def poor(self) -> tuple[Edge, ...]:
         """The edges whose flights would be poor (`find_poor_edges`); unknown where each surface is kept once."""
-        return () if self.scene.joint else find_poor_edges(self.scene, self.views, self.tour.overlaps)
+        return () if self.scene.joint else find_poor_edges(self.surfaces, self.tour.overlaps)
 
     @cached_property
     def plan(self) -> Plan:
@@ -162,5 +163,5 @@ class TourFacts:
 
     @_stored
     def _plan(self) -> dict[str, Any]:
-        plan = make_plan(self.scene, self.tour, self.heights)
+        plan = make_plan([*self.surfaces.values()], self.tour, self.heights)
         return {name: value for name, value in vars(plan).items() if name != "tour"}

@@ -11,9 +11,8 @@ import shapely
 from jaxtyping import Float
 from shapely.geometry import Polygon
 
-from pansplat.gaussians.scene import Scene
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import sample_surfaces, split_by_azimuth
+from pansplat.tours.surfaces import Surfaces, split_by_azimuth
 
 _CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
 _AZIMUTHS = 180  # of a floor outline
@@ -37,24 +36,11 @@ class FloorOutline:
     camera_height: float
 
 
-def find_camera_height(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> float | None:
-    """Height of a view's camera over the floor that its Gaussians show, metres; None if they show no floor.
-
-    The floor is the most frequent height in the directions steeply below the camera.
-
-    Args:
-        scene: the scene.
-        view: index of the view.
-        level: right, down and forward (columns) of a level camera.
-    """
-    return _find_floor(sample_surfaces(scene, view, level))
-
-
 def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
     """The median of those heights of cameras that are known; a fraction of `far` if none is.
 
     Args:
-        heights: of `find_camera_height` or of floor outlines, metres.
+        heights: of `find_floor` or of floor outlines, metres.
         far: of the scene or tour, metres.
     """
     known = [height for height in heights if height is not None]
@@ -67,11 +53,16 @@ def find_ceiling(places: Float[np.ndarray, "n 3"]) -> float | None:
     Args:
         places: of surfaces relative to the camera (right, down, forward).
     """
-    return _find_floor(places * (1, -1, 1))
+    return find_floor(places * (1, -1, 1))
 
 
-def _find_floor(places: Float[np.ndarray, "n 3"]) -> float | None:
-    """The most frequent distance downwards of the places that are steeply below; None if they are fewer than 20."""
+def find_floor(places: Float[np.ndarray, "n 3"]) -> float | None:
+    """Height of a camera over the floor: the most frequent one of the places that are steeply below; None if they are
+    fewer than 20.
+
+    Args:
+        places: see `find_ceiling`.
+    """
     right, down, forward = places.T
     steep = (down > 0.6 * np.hypot(right, forward)) & (down > 0)
     if steep.sum() < 20:
@@ -82,20 +73,17 @@ def _find_floor(places: Float[np.ndarray, "n 3"]) -> float | None:
     return float(np.exp(np.median(logs[np.abs(logs - peak) < 0.08])))
 
 
-def find_floor_outline(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> FloorOutline | None:
-    """The floor outline of a view from its Gaussians; None if they show no floor.
+def find_floor_outline(surfaces: Surfaces) -> FloorOutline | None:
+    """The floor outline of a panorama; None if it shows no floor.
 
-    At each azimuth the floor (`find_camera_height`) ends at the distance within which 98 % of its Gaussians are, or at
-    the surfaces that stand on it, if these are nearer.
-
-    Args:
-        scene, view, level: see `find_camera_height`.
+    At each azimuth the floor (`find_floor`) ends at the distance within which 98 % of it is, or at the surfaces that
+    stand on it, if these are nearer.
     """
-    found = trace_floor(sample_surfaces(scene, view, level))
+    found = trace_floor(surfaces.samples)
     if found is None:
         return None
     corners, height = found
-    center = level[:, (0, 2)].T @ scene.cam2world[view, :3, 3].double().numpy()
+    center = surfaces.center[[0, 2]]
     return FloorOutline(center, center + corners, height)
 
 
@@ -107,7 +95,7 @@ def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "az
     Args:
         places: of surfaces relative to the camera (right, down, forward), in any unit.
     """
-    height = _find_floor(places)
+    height = find_floor(places)
     if height is None:
         return None
     down = places[:, 1]

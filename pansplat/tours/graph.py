@@ -26,6 +26,7 @@ from pansplat.system.descriptions import describe_count, describe_range, list_fi
 from pansplat.tours.edges import find_walls
 from pansplat.tours.layout import REACH, lay_out
 from pansplat.tours.outlook import find_clearance
+from pansplat.tours.surfaces import find_surfaces
 
 Edge = tuple[int, int]
 """Indices of two panoramas, the smaller one first; a panorama without another one has a self-edge, twice its index."""
@@ -648,9 +649,8 @@ def merge_scenes(tour: TourGraph, load: Callable[[ViewNumbers], Scene], max_view
             and (scale := tour._find_scale(about, drawn.beside) * tour.panoramas[drawn.beside].frame.unit)
         ),
     )
-    return dataclasses.replace(
-        merged, overlaps=tour.with_walls(find_walls(merged, range(len(tour)), tour.overlaps)).list_overlaps()
-    )
+    walls = find_walls(dict(enumerate(find_surfaces(merged, tour.level_axes))), tour.overlaps)
+    return dataclasses.replace(merged, overlaps=tour.with_walls(walls).list_overlaps())
 
 
 def list_starts(panoramas: Sequence[Panorama]) -> Starts:

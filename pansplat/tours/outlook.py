@@ -7,8 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
-from pansplat.gaussians.scene import Scene
-from pansplat.tours.surfaces import OPAQUE, locate_surfaces
+from pansplat.tours.surfaces import Surfaces
 
 BINS = 24  # of the horizon; the first one begins at the yaw -pi
 _ROWS = 12  # of clearances, from above to below
@@ -19,30 +18,18 @@ _CONE = math.cos(math.radians(2))  # around the direction of a mark
 _IN_FRONT, _HIDING = 0.8, 0.5  # of its distance, and the share of the surfaces there that hide it
 
 
-def measure_outlook(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "bin"]:
-    """Median distances of what a view's camera sees around the horizon; 0 where it sees nothing.
-
-    Args:
-        scene: with all Gaussians of the view.
-        view: number of the camera.
-        level: axes of a level camera, as columns right, down and forward.
-    """
-    offsets = locate_surfaces(scene, view, level, min_opacity=OPAQUE)
-    distances = np.linalg.norm(offsets, axis=1)
+def measure_outlook(surfaces: Surfaces) -> Float[np.ndarray, "bin"]:
+    """Median distances of what a camera sees around the horizon; 0 where it sees nothing."""
+    offsets, distances = surfaces.opaque, surfaces.distances
     is_ahead = np.abs(offsets[:, 1]) < _ELEVATION * distances
     bins = ((np.arctan2(offsets[:, 0], offsets[:, 2]) / (2 * math.pi) + 0.5) * BINS).astype(int) % BINS
     found = [distances[is_ahead & (bins == number)] for number in range(BINS)]
     return np.array([np.median(own) if len(own) else 0.0 for own in found])
 
 
-def measure_clearance(scene: Scene, view: int, level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "row bin"]:
-    """Distances of the nearest surfaces around a view's camera, from above to below; 0 where it sees nothing.
-
-    Args:
-        scene, view, level: see `measure_outlook`.
-    """
-    offsets = locate_surfaces(scene, view, level, min_opacity=OPAQUE)
-    distances, cells = np.linalg.norm(offsets, axis=1), _find_cells(offsets)
+def measure_clearance(surfaces: Surfaces) -> Float[np.ndarray, "row bin"]:
+    """Distances of the nearest surfaces around a camera, from above to below; 0 where it sees nothing."""
+    distances, cells = surfaces.distances, _find_cells(surfaces.opaque)
     order = np.lexsort((distances, cells))
     first, last = (np.searchsorted(cells[order], np.arange(_ROWS * BINS), side) for side in ("left", "right"))
     nearest = np.append(distances[order], 0.0)[first + (_NEAREST * (last - first)).astype(int)]
@@ -73,14 +60,14 @@ def find_widest(outlook: Float[np.ndarray, "bin"]) -> float:
     return ((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi
 
 
-def find_hidden(places: Float[np.ndarray, "n 3"], marks: Float[np.ndarray, "mark 3"]) -> list[int]:
+def find_hidden(surfaces: Surfaces, marks: Float[np.ndarray, "mark 3"]) -> list[int]:
     """The marks that most surfaces in their directions are in front of.
 
     Args:
-        places: of the surfaces relative to the camera (`locate_surfaces`).
+        surfaces: around a camera.
         marks: relative to the camera, in the same axes.
     """
-    distances, found = np.linalg.norm(places, axis=1), []
+    places, distances, found = surfaces.opaque, surfaces.distances, []
     for number, mark in enumerate(marks):
         length = float(np.linalg.norm(mark))
         ahead = distances[places @ mark > _CONE * distances * length]

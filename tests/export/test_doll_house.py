@@ -104,7 +104,7 @@ def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(
     scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
 ) -> None:
-    house = make_house(scene, rooms, np.eye(3), photograph())
+    house = make_house(scene, rooms, photograph())
     places, colors = _sample(house)
     walls = shapely.union_all([outline.exterior for outline in (*BOXES, PASSAGE)])
     to_wall = shapely.distance(walls, shapely.points(places[:, [0, 2]]))
@@ -161,7 +161,7 @@ def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
     hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)
     screen = Gaussians.cat([scene.gaussians, make_balls(hidden, 0.03, views=0)])
     for shown, expected in ((scene, 0), (dataclasses.replace(scene, gaussians=screen), 2)):
-        house = make_house(shown, rooms, np.eye(3), pairs)
+        house = make_house(shown, rooms, pairs)
         places, colors = _sample(house, 3000)
         own = colors.argmax(axis=1)
         x, y, z = places.T
@@ -205,7 +205,7 @@ def test_a_room_of_another_world_stands_beside_the_house_on_its_floor(scene: Sce
     vars(plan)["drawn"] = {2: DrawnPlace(0, math.pi / 2, np.array((8.0, 10.0)))}
     floors = np.array((FLOOR, FLOOR, FLOOR - 0.2))
     apart = dataclasses.replace(rooms, plan=plan, floors=floors, houses=((0, 1), (2,)))
-    house = make_house(scene, apart, np.eye(3))
+    house = make_house(scene, apart)
     (corners,), ((*_, moved),) = house.corners, (house.nodes[0].values(),)
     assert len(house.nodes) == 1 and moved[0] == math.pi / 2
     assert moved[1] == pytest.approx((8 + CAMERAS[2][2], 0.2, 10 - CAMERAS[2][0]))
@@ -225,7 +225,7 @@ def test_textures_of_many_rooms_fit_into_the_atlas(rooms: Rooms) -> None:
 
 
 def test_without_a_house_there_is_no_atlas(scene: Scene, rooms: Rooms) -> None:
-    house = make_house(scene, dataclasses.replace(rooms, houses=()), np.eye(3))
+    house = make_house(scene, dataclasses.replace(rooms, houses=()))
     assert (house.corners, house.atlas) == ((), b"")
 
 
@@ -233,7 +233,7 @@ def test_without_photographs_the_gaussians_are_shown(scene: Scene, rooms: Rooms)
     means = scene.gaussians.means
     color = torch.from_numpy(_color(means.numpy()))
     gaussians = make_balls(means, 0.03, 0.99, color=color, views=scene.gaussians.views)
-    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), rooms, np.eye(3))
+    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), rooms)
     places, colors = _sample(house)
     assert np.median(np.abs(colors - _color(places)).max(axis=1)) < 0.1
 

@@ -16,7 +16,7 @@ from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
 from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load_model, load_pairs, load_predictor, predict, render
 from pansplat.prediction_options import PredictOptions
-from pansplat.sweep.guided_sweep import NetworkPrior, load_guided_sweep, save_network
+from pansplat.sweep.guided_sweep import NetworkPrior, default_weights, load_guided_sweep, save_network
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.surface import resize_sphere
 
@@ -54,7 +54,7 @@ def _images(views=2, height=64):
 
 
 def test_saved_network_estimates_the_same_depth(weights):
-    loaded, network = load_guided_sweep(weights), NetworkPrior(_network(), _sharpening(), "", 64)
+    loaded, network = load_guided_sweep(weights), NetworkPrior(lambda: (_network(), _sharpening()), "", 64)
     assert isinstance(loaded.prior, NetworkPrior)
     loaded.prior.height = 64
     first, second = (prior.observe(_images()).priors for prior in (loaded.prior, network))
@@ -65,7 +65,7 @@ def test_saved_network_estimates_the_same_depth(weights):
 
 
 def test_sharpened_depth_has_the_networks_size_and_the_views_order():
-    observed = NetworkPrior(_network(), _sharpening(), "", 64).observe(_images())
+    observed = NetworkPrior(lambda: (_network(), _sharpening()), "", 64).observe(_images())
     both = observed.sharpen()
     assert [log_depth.shape for log_depth in both] == [(64, 128)] * 2
     estimates = [prior.log_depth.ravel() for prior in observed.priors]
@@ -76,7 +76,7 @@ def test_sharpened_depth_has_the_networks_size_and_the_views_order():
 
 
 def test_refined_depth_is_in_the_unit_of_the_poses():
-    prior = NetworkPrior(_network(), _sharpening(), "", 64)
+    prior = NetworkPrior(lambda: (_network(), _sharpening()), "", 64)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = (0, 0.5, 1)
     far = poses.copy()
@@ -90,7 +90,7 @@ def test_refined_depth_is_in_the_unit_of_the_poses():
 
 
 def test_networks_on_a_card_estimate_what_those_on_the_processor_do(monkeypatch):
-    prior, poses = NetworkPrior(_network(), _sharpening(), "", 64), np.tile(np.eye(4), (2, 1, 1))
+    prior, poses = NetworkPrior(lambda: (_network(), _sharpening()), "", 64), np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.5
 
     def estimate():
@@ -105,7 +105,12 @@ def test_networks_on_a_card_estimate_what_those_on_the_processor_do(monkeypatch)
     assert count["copies"] and not any("mixed" in name for name in count if count[name])
     for first, second in zip(expected, got, strict=True):
         np.testing.assert_allclose(second, first, atol=1e-4)
-    assert {weight.device.type for weight in prior.network.parameters()} == {"cpu"}, "which other threads use"
+    assert {weight.device.type for weight in prior.networks[0].parameters()} == {"cpu"}, "which other threads use"
+
+
+def test_the_shipped_networks_are_read_when_they_are_needed_first():
+    """Scenes in the cache need their fingerprint only."""
+    assert "networks" not in vars(load_guided_sweep(default_weights()).prior)
 
 
 def test_fingerprint_depends_on_the_weights(weights, tmp_path):
@@ -199,7 +204,7 @@ def test_depth_network_replaces_the_sharpening_network(weights, tmp_path):
     """The surface has the edges of the red channel, which is the network's inverse depth."""
     pytest.importorskip("onnxruntime")
     prior = load_guided_sweep(weights, "depth", _write_depth_network(tmp_path / "red.onnx")).prior
-    torch.nn.init.zeros_(prior.network.mono.head.weight)  # an estimate of one distance
+    torch.nn.init.zeros_(prior.networks[0].mono.head.weight)  # an estimate of one distance
     images = np.full((2, 64, 128, 3), 0.2, np.float32)
     images[0, 20:44, :30, 0], images[1, 20:44, 60:90, 0] = 0.8, 0.8
     for image, log_depth in zip(images, prior.observe(images).sharpen(), strict=True):

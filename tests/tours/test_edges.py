@@ -9,7 +9,7 @@ import torch
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.edges import find_poor_edges, find_walls, judge_edges, measure_doubled
-from pansplat.tours.surfaces import find_colors, locate_surfaces
+from pansplat.tours.surfaces import Surfaces, find_surfaces
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,12 @@ def bend(room: Scene, factor: float) -> Scene:
 
 
 def locate(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
-    places = locate_surfaces(scene, view, np.eye(3), min_opacity=0.5)
-    return places, find_colors(scene, view, min_opacity=0.5)
+    surfaces = find_surfaces(scene, np.eye(3))[view]
+    return surfaces.opaque, surfaces.colors
+
+
+def name(scene: Scene, *nodes: int) -> dict[int, Surfaces]:
+    return dict(zip(nodes, find_surfaces(scene, np.eye(3)), strict=True))
 
 
 def measure(scene: Scene) -> float:
@@ -61,10 +65,10 @@ def test_only_the_directions_of_a_flight_count(room: Scene) -> None:
 
 def test_an_edge_is_poor_if_its_surfaces_disagree(room: Scene) -> None:
     edges = [(4, 7), (4, 4), (4, 9)]
-    small = bend(room, 0.35)
-    (good,), (bad,) = (judge_edges(scene, (4, 7), edges).items() for scene in (room, small))
+    room, small = (name(scene, 4, 7) for scene in (room, bend(room, 0.35)))
+    (good,), (bad,) = (judge_edges(surfaces, edges).items() for surfaces in (room, small))
     assert good[0] == bad[0] == (4, 7) and 0 < good[1] < bad[1] - 0.2
-    assert find_poor_edges(room, (4, 7), edges) == () and find_poor_edges(small, (4, 7), edges) == ((4, 7),)
+    assert find_poor_edges(room, edges) == () and find_poor_edges(small, edges) == ((4, 7),)
 
 
 @pytest.mark.parametrize(
@@ -81,4 +85,4 @@ def test_a_wall_is_what_both_cameras_see_in_front_of_the_other(sizes, is_wall):
         parts.append(dataclasses.replace(own, means=means, views=torch.full_like(own.views, view)))
     scene = Scene(Gaussians.cat(parts), poses, 0.1, 10.0)
     edges = ((3, 5), (5, 7), (3, 3))
-    assert find_walls(scene, (3, 5), edges) == ([(3, 5)] if is_wall else [])
+    assert find_walls(name(scene, 3, 5), edges) == ([(3, 5)] if is_wall else [])

@@ -8,11 +8,12 @@ import pytest
 import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
+from pansplat.export.plan_files import write_plan
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours import facts
 from pansplat.tours.facts import TourFacts
 
-PARTS = ("heights", "outlines", "outlooks", "clearances", "walls", "poor", "plan")
+PARTS = ("heights", "ceilings", "outlines", "outlooks", "clearances", "hidden", "walls", "poor", "plan")
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +35,7 @@ def test_what_is_read_from_the_store_equals_what_was_computed(
     computed = TourFacts(scene, folder=tmp_path)
     expected = [getattr(computed, part) for part in PARTS]
     assert len(computed.plan.rooms) == 1 and set(computed.outlines) == {0, 1}
-    for name in ("find_camera_height", "find_floor_outline", "measure_outlook", "measure_clearance"):
-        monkeypatch.setattr(facts, name, forbid)
-    for name in ("find_walls", "find_poor_edges", "make_plan"):
+    for name in ("find_surfaces", "find_floor", "find_walls", "make_plan"):
         monkeypatch.setattr(facts, name, forbid)
     stored = TourFacts(scene, folder=tmp_path)
     for part, value in zip(PARTS, expected, strict=True):
@@ -76,3 +75,13 @@ def test_what_depends_on_a_change_is_computed_again(what: str, scene: Scene, tmp
 def test_nothing_is_written_without_a_folder(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert TourFacts(scene).plan.rooms and list(tmp_path.iterdir()) == []
+
+
+def test_the_plan_of_a_file_is_stored_beside_the_panoramas(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = write_plan(scene, tmp_path / "first.svg", tmp_path)
+    for name in ("find_surfaces", "make_plan"):
+        monkeypatch.setattr(facts, name, forbid)
+    again = write_plan(scene, tmp_path / "again.svg", tmp_path)
+    assert np.array_equal(first.rooms[0].outline, again.rooms[0].outline)

@@ -13,6 +13,7 @@ from pansplat.inputs.pairs import Panorama
 from pansplat.tours import floor
 from pansplat.tours.floor import find_floor_outline
 from pansplat.tours.graph import TourGraph, make_graph
+from pansplat.tours.surfaces import find_surfaces
 
 
 @pytest.fixture(scope="module")
@@ -26,15 +27,17 @@ def room_scene() -> Scene:
 
 def test_the_floor_of_a_room_ends_at_its_walls(room_scene):
     level = room_scene.cam2world[0, :3, :3].numpy()
-    outline = find_floor_outline(room_scene, 0, level)
+    (surfaces,) = find_surfaces(room_scene, level)
+    outline = find_floor_outline(surfaces)
     assert outline.camera_height == pytest.approx(1.5, abs=0.01)
     assert np.allclose(outline.center, (0.5, 0.0)), "right is x, forward is y of this world"
     inside = (outline.corners - (-1, -2)) / (4, 6)
     border = np.minimum(inside, 1 - inside).min(axis=1)
     assert np.abs(border).max() < 0.04, "all corners are near a wall"
     scene = Scene(room_scene.gaussians.select(torch.arange(20)), room_scene.cam2world, 0.45, 10.0)
-    assert find_floor_outline(scene, 0, level) is None and floor.find_camera_height(scene, 0, level) is None
-    assert floor.find_camera_height(room_scene, 0, level) == outline.camera_height
+    (few,) = find_surfaces(scene, level)
+    assert find_floor_outline(few) is None and floor.find_floor(few.samples) is None
+    assert floor.find_floor(surfaces.samples) == outline.camera_height
     assert floor.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
     assert floor.choose_camera_height((None,), 10.0) == 1.5
 

@@ -35,9 +35,10 @@ from pansplat.refinement.budget import merge_to
 from pansplat.system.atomic import replacing
 from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import find_camera_height
+from pansplat.tours.floor import find_floor
 from pansplat.tours.graph import make_graph, select_views
 from pansplat.tours.outlook import find_bin, measure_clearance, measure_outlook
+from pansplat.tours.surfaces import find_surfaces
 
 
 @pytest.fixture(autouse=True)
@@ -63,8 +64,8 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
     level = np.array(header["level"])
     assert np.allclose(level @ level.T, np.eye(3), atol=1e-6) and np.linalg.det(level) > 0
     assert np.allclose(level[:, 1], (0, 1, 0), atol=1e-6)  # the cameras are upright: y is down
-    for view, spot in enumerate(header["spots"]):  # rings are on the floor below the cameras
-        height = find_camera_height(scene, view, level)
+    for spot, surfaces in zip(header["spots"], find_surfaces(scene, level), strict=True):
+        height = find_floor(surfaces.samples)  # rings are on the floor below the cameras
         assert np.array(spot["mark"]) - spot["position"] == pytest.approx((0, height, 0), abs=1e-5)
 
 
@@ -74,27 +75,23 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     write_page(room, tmp_path / "room.html")
     header = read_header(tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
-    tour = make_graph(room)
     found, (expected,) = header["plan"], TourFacts(room).plan.rooms
     svg, size, marks = draw_page_plan(TourFacts(room).plan)
     assert found["rooms"] == [[0, 1]] and found["worlds"] == [0, 0] and b"west / east" in svg
     assert base64.b64decode(found["drawing"]) == svg and found["size"] == pytest.approx(size)
-    turn = level[:, (0, 2)].T @ tour.level_axes[:, (0, 2)]  # they differ by a quarter turn
-    quarter = math.atan2(*(tour.level_axes[:, (0, 2)].T @ level[:, 2]))
-    for place, (x, y, heading) in zip(found["places"], marks, strict=True):
-        assert place == pytest.approx((x, y, heading + quarter), abs=1e-5) and abs(quarter) > 1.5
+    assert np.allclose(level, make_graph(room).level_axes) and np.allclose(found["places"], marks)
     c, s = math.cos(found["places"][0][2]), math.sin(found["places"][0][2])
     step = (cameras[1, :3, 3] - cameras[0, :3, 3]).numpy() @ level[:, (0, 2)] @ ((c, -s), (s, c)) * (1, -1)
     assert np.subtract(found["places"][1], found["places"][0])[:2] == pytest.approx(step, abs=1e-5)
-    outline = expected.outline @ turn.T
     (house,) = header["doll"]
     corners = np.array(house["corners"])
     top = corners[:, 3:].max(axis=1) > 1
     places, normals = (corners[:, :3] @ level)[:, (0, 2)] + level[:, (0, 2)].T @ middle, corners[top, 3:] - 2
-    to_wall = shapely.distance(shapely.Polygon(expected.outline @ turn.T).exterior, shapely.points(places[~top]))
+    to_wall = shapely.distance(shapely.Polygon(expected.outline).exterior, shapely.points(places[~top]))
     assert house["nodes"] == [0, 1] and to_wall.max() < 1e-3, "all corners of floor and walls are on the outline"
     inward, outward = (
-        shapely.contains_xy(shapely.Polygon(outline), *(places[top] + step * normals).T).mean() for step in (0.3, -0.3)
+        shapely.contains_xy(shapely.Polygon(expected.outline), *(places[top] + step * normals).T).mean()
+        for step in (0.3, -0.3)
     )
     assert inward > outward + 0.4, "normals are in the page's axes"
     # What hides the mark of the other panorama is a wall between them.
@@ -188,13 +185,13 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
     assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[1]["ahead"][1] == 0
     assert [spot["hasStart"] for spot in spots] == [True, False, False, True]
-    np.testing.assert_allclose(spots[1]["clearances"], measure_clearance(flat, 1, level), atol=0.0051)
+    np.testing.assert_allclose(spots[1]["clearances"], measure_clearance(find_surfaces(flat, level)[1]), atol=0.0051)
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4) and to["pitch"] == -0.6
     right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
-    wall = measure_outlook(flat, 0, level)[find_bin(0.5 * math.pi)]
+    wall = measure_outlook(find_surfaces(flat, level)[0])[find_bin(0.5 * math.pi)]
     assert (right, ahead) == pytest.approx((max(down / np.tan(0.6), 1), 0), rel=0.01, abs=1e-5) and right < wall
     assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
     assert sorted(header["walk"]) == [0, 1, 2, 3] and header["walk"][0] == 0
