@@ -1,7 +1,7 @@
 // The doll's house view: the camera turns around the rooms from outside, and no wall is drawn that shows its back. docs/web.md
 // describes it.
 
-import { MAX_PITCH, tangentOf, turned } from "./camera.js";
+import { tangentOf, turned } from "./camera.js";
 import { clamp, column, cross, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { camera, changed, state } from "./state.js";
 
@@ -64,7 +64,7 @@ function placeOutside(yaw, pitch) {
 export function orbit(yaw, pitch) {
   if (state.doll.flight) return;
   camera.yaw += yaw;
-  camera.pitch = clamp(camera.pitch + pitch, -MAX_PITCH, LOWEST);
+  camera.pitch = clamp(camera.pitch + pitch, -HEADER.maxPitch, LOWEST);
   camera.position = placeOutside(camera.yaw, camera.pitch);
   changed();
 }

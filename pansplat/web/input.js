@@ -1,6 +1,6 @@
 // Keys, pointers, the wheel, the device's motion, and buttons.
 
-import { MAX_FOV, MAX_PITCH, MIN_FOV, tangentOf, turn, walk } from "./camera.js";
+import { tangentOf, turn, walk } from "./camera.js";
 import { orbit, resizeDoll, zoomDoll } from "./doll.js";
 import { byId, canvas, say, showMore } from "./dom.js";
 import { embed } from "./embed.js";
@@ -102,7 +102,7 @@ function onWheel(event) {
   const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
   const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
   if (state.doll.isOn) zoomDoll(factor);
-  else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
+  else camera.fov = clamp(camera.fov * factor, HEADER.minFov, HEADER.maxFov);
   changed();
 }
 
@@ -126,7 +126,7 @@ function onOrientation({ alpha, beta, gamma }) {
   if (motion.last === null) motion.last = yaw;
   camera.yaw += yaw - motion.last;  // so that a drag can turn the camera, too
   motion.last = yaw;
-  camera.pitch = clamp(pitch, -MAX_PITCH, MAX_PITCH);
+  camera.pitch = clamp(pitch, -HEADER.maxPitch, HEADER.maxPitch);
   camera.roll = Math.atan2(dot(right, down), dot(right, across));
   changed();
 }

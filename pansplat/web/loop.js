@@ -1,7 +1,7 @@
 // Frames. One is drawn only if something changed. While the picture moves, the scale of its resolution follows the time
 // between frames; at rest it has the full resolution.
 
-import { FADE_MS, nodeHere, showViews, tangentOf, updateEdge, walk } from "./camera.js";
+import { nodeHere, showViews, tangentOf, updateEdge, walk } from "./camera.js";
 import { orbitByKeys } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { embed } from "./embed.js";
@@ -36,12 +36,12 @@ export function advance(now, seconds) {
   advanceFlight(now);
   advanceDollFlight(now);
   if (edges.length && !state.doll.isOn) updateEdge(now);
-  showViews(1000 * seconds / FADE_MS);
+  showViews(seconds / HEADER.fadeSeconds);
   photographs.update(seconds);
   updateStill(now);
   loadAround();
   const node = nodeHere(), isMoving = state.flight !== null || state.doll.flight !== null || isWaiting();
-  const isThere = !isMoving && !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;
+  const isThere = !isMoving && !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.ringRadius;
   embed.follow(isThere ? node : null, isMoving);
 }
 
@@ -51,7 +51,7 @@ export function onFrame(now) {
   const elapsed = now - lastFrame, seconds = Math.min(elapsed, 100) / 1000;
   lastFrame = now;
   if (state.doll.isOn) orbitByKeys(state.step, seconds);
-  else if (state.step.some((value) => value)) walk(...scaled(state.step, seconds * HEADER.speed * (state.isFast ? 3 : 1)));
+  else if (state.step.some((value) => value)) walk(...scaled(state.step, seconds * HEADER.speed * (state.isFast ? HEADER.fast : 1)));
   advance(now, seconds);
   if (state.sorted) requestSort();
   const moving = now - state.lastChange < REST_MS;

@@ -24,7 +24,7 @@ export function makeNotes() {
 
 // `toWindow`: from camera axes.
 export function placeNotes(rotation, toWindow) {
-  const here = nodeHere(), isThere = !state.doll.isOn && distanceOf(GRAPH.positions[here], camera.position) < HEADER.spots[here].radius;
+  const here = nodeHere(), isThere = !state.doll.isOn && distanceOf(GRAPH.positions[here], camera.position) < HEADER.ringRadius;
   for (const { node, direction, button } of markers) {
     const place = [0, 1, 2].map((k) => dot(column(rotation, k), direction)), [left, top] = toWindow(place);
     button.hidden = !isThere || node !== here || place[2] < 0.1;

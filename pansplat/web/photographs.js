@@ -7,10 +7,6 @@ import { clamp, column, distanceOf, dot, minus, multiply, scaled } from "./graph
 import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
-export const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
-const PHOTO_FADE = 0.2;             // seconds
-const FIRST = 0.1;                  // of a flight, for which a photograph is shown at both ends; it fades over as much
-const AROUND = 2.5;                 // metres, usual distance of surfaces: so far is the photograph of a camera beside it
 const DENSITY = 1.3;                // texels of a pixel in the middle of a face, at least
 const KEPT = 3;                     // photographs whose textures are kept
 const AT_ONCE = 6;                  // tiles that are read at the same time
@@ -120,7 +116,7 @@ class Photographs {
 
   // The panorama at which the camera stands, as no eye of a headset does; the nearest where there is nothing else to show.
   findNode() {
-    const node = nodeHere(), isThere = !state.headset.session && distanceOf(GRAPH.positions[node], camera.position) <= STANDS;
+    const node = nodeHere(), isThere = !state.headset.session && distanceOf(GRAPH.positions[node], camera.position) <= HEADER.stopReach;
     return !state.doll.isOn && (isThere || isFixed()) ? node : null;
   }
 
@@ -130,7 +126,7 @@ class Photographs {
     if (!leg?.path || !leg.done || state.headset.session) return null;
     const isFirst = leg.done < 0.5, node = isFirst ? leg.from : leg.to;
     const isReady = node !== null && this.levelsOf(node)[0].isReady;
-    return { node, opacity: isReady ? clamp(2 - (isFirst ? leg.done : 1 - leg.done) / FIRST, 0, 1) : 0 };
+    return { node, opacity: isReady ? clamp(2 - (isFirst ? leg.done : 1 - leg.done) / HEADER.covered, 0, 1) : 0 };
   }
 
   // The smallest tiles of the photograph at the camera.
@@ -198,7 +194,7 @@ class Photographs {
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
-    const step = state.still?.began === null ? 1 : seconds / PHOTO_FADE;  // the still covers it
+    const step = state.still?.began === null ? 1 : seconds / HEADER.stopSeconds;  // the still covers it
     this.opacity = clamp(this.target, this.opacity - step, this.opacity + step);
     changed();
   }
@@ -249,7 +245,9 @@ class Photographs {
     // The rows of the inverse are the columns of the rotation; y of a cube map is up.
     const inverse = [0, 1, 2].map((k) => column(rotation, k)), turned = multiply(inverse, HEADER.photographs[this.node].rotation);
     gl.uniformMatrix3fv(places.camera_to_cube, false, turned.flatMap(([x, y, z]) => [x, -y, z]));
-    const beside = state.headset.session ? [0, 0, 0] : scaled(minus(camera.position, GRAPH.positions[this.node]), 1 / AROUND);
+    const offset = minus(camera.position, GRAPH.positions[this.node]), away = Math.hypot(...offset);
+    const part = state.headset.session ? 0 : Math.min(1 / HEADER.surfaces, HEADER.mostBeside / Math.max(away, 1e-9));
+    const beside = scaled(offset, part);
     gl.uniform3fv(places.beside, inverse.map((axis) => dot(axis, beside)));
     gl.uniform4f(places.window, ...center, ...half);
     gl.uniform2f(places.size, width, height);

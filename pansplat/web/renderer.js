@@ -2,7 +2,6 @@
 
 import { scaled } from "./graph.js";
 
-const BATCH = HEADER.batch;         // quads of one instance
 const TEXTURE_WIDTH = 2048;         // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
 // Draws to a WebGL 2 context: one layer for each view, and their mean by nearness (docs/rendering.md, section 7).
@@ -27,7 +26,7 @@ export class Renderer {
     this.screen = gl.createVertexArray();
     gl.bindVertexArray(this.splats);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+    const corners = Uint16Array.from({ length: 6 * HEADER.batch }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     this.targets = [];
     this.size = [0, 0];
@@ -219,7 +218,7 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.splats);
     gl.uniform2i(this.splat.places.segment, start, count);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * HEADER.batch, gl.UNSIGNED_SHORT, 0, Math.ceil(count / HEADER.batch));
   }
 
   addLayer(textures, weight, isFirst) {

@@ -18,9 +18,9 @@ export function makeRings() {
   rings = marks.map(({ node, link }) => {
     const { name, position, mark } = HEADER.spots[node], text = make("small", "");
     const label = make("span", "", make("b", "", name), text), button = make("button", "", label);
-    const place = link ? { mark: link.mark, camera: null, radius: HEADER.spots[link.from].radius } : { mark, camera: position, radius: HEADER.spots[node].radius };
+    const place = link ? { mark: link.mark, camera: null } : { mark, camera: position };
     const heightOf = (point) => dot(column(HEADER.level, 1), point);
-    const isUpright = link !== null && heightOf(link.mark) < heightOf(HEADER.spots[link.from].mark) - 0.5 * place.radius;
+    const isUpright = link !== null && heightOf(link.mark) < heightOf(HEADER.spots[link.from].mark) - 0.5 * HEADER.ringRadius;
     button.hidden = true;
     button.onclick = () => goTo(node);
     byId("spots").append(button);
@@ -47,7 +47,7 @@ function update() {
 export function findRings() {
   update();
   if (state.doll.isOn) return rings.filter(({ link, node }) => !link && isInDoll(node));
-  return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= 2 * ring.radius);
+  return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= HEADER.ringDistance);
 }
 
 // Rings in perspective, and arrows at the border to those that are outside or under a control; none while the camera flies. A
@@ -82,11 +82,11 @@ export function placeRings(rotation) {
 }
 
 // The box of a ring in the picture; null for one outside or under a control. On the floor it is seen from above.
-function findPlace({ radius, isUpright }, [x, y, z], focal, bars) {
+function findPlace({ isUpright }, [x, y, z], focal, bars) {
   const { clientWidth: width, clientHeight: height } = canvas, [left, top] = [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
-  const size = clamp(2 * radius * focal / z, 16, 128), tall = isUpright ? size : size * clamp(y / Math.hypot(x, y, z), 0.25, 1);
+  const size = clamp(2 * HEADER.ringRadius * focal / z, 16, 128), tall = isUpright ? size : size * clamp(y / Math.hypot(x, y, z), 0.25, 1);
   const box = [left - 0.5 * size, top - 0.5 * tall, left + 0.5 * size, top + 0.5 * tall];
-  return z > 0.1 * radius && left > 0 && left < width && top > 0 && top < height && !bars.some((bar) => isCovered(box, bar)) ? box : null;
+  return z > 0.1 * HEADER.ringRadius && left > 0 && left < width && top > 0 && top < height && !bars.some((bar) => isCovered(box, bar)) ? box : null;
 }
 
 // The box of an arrow to where the camera turns towards an offset, and its `side`; null where the side is full.

@@ -253,7 +253,7 @@ class Headset {
     const found = findRings().map((ring) => {
       const offset = minus(ring.mark, ray.origin), distance = Math.hypot(...offset);
       const angle = Math.acos(clamp(dot(ray.direction, offset) / Math.max(distance, 1e-6), -1, 1));
-      return { ring, distance, angle, limit: Math.max(1.2 * ring.radius / Math.max(distance, 1e-6), MIN_POINTING) };
+      return { ring, distance, angle, limit: Math.max(1.2 * HEADER.ringRadius / Math.max(distance, 1e-6), MIN_POINTING) };
     });
     return found.filter(({ angle, limit }) => angle < limit).sort((a, b) => a.angle - b.angle)[0] || null;
   }
@@ -311,14 +311,14 @@ class Headset {
     }
     for (const ring of findRings()) {
       const strength = pointed.has(ring) ? 1 : 0.6, across = unit(cross(down, minus(ring.mark, camera.position)));
-      const axes = (ring.isUpright ? [across, down] : [right, ahead]).map((axis) => scaled(axis, ring.radius));
+      const axes = (ring.isUpright ? [across, down] : [right, ahead]).map((axis) => scaled(axis, HEADER.ringRadius));
       marks.push({ center: ring.mark, axes, shape: RING, color: Array(4).fill(strength) });
     }
     const [ring] = pointed.keys();
     if (ring) {
       const size = 0.05 * pointed.get(ring), across = unit(cross(down, minus(ring.mark, camera.position)));
       const axes = [scaled(across, 8 * size), scaled(down, size)];
-      marks.push({ center: minus(ring.mark, scaled(down, 2 * ring.radius)), axes, shape: PICTURE, color: [1, 1, 1, 1], ring });
+      marks.push({ center: minus(ring.mark, scaled(down, 2 * HEADER.ringRadius)), axes, shape: PICTURE, color: [1, 1, 1, 1], ring });
     }
     return marks;
   }

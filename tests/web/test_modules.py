@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.export.page_data import PageHeader
+from pansplat.export.page_data import PageConstants, PageHeader
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.pairs import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
-from pansplat.tours.layout import REACH
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
@@ -122,7 +121,7 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         for place in positions
     ]
     house = make_house([node for node, part in enumerate(parts) if part == 0])
-    return {
+    return msgspec.to_builtins(PageConstants()) | {
         "spots": spots,
         "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
         "level": np.eye(3).tolist(),
@@ -132,10 +131,8 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         "parts": parts,
         "limits": [2.0] * (max(parts) + 1),
         "hysteresis": 0.25,
-        "reach": 2.0,
         "poor": [],
         "next": [],
-        "tallest": 1.5,
         "doll": [house | {"moves": [(0.0, *positions[node]) for node in house["nodes"]]}],
     }
 
@@ -167,7 +164,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         "clearances": [clearances[view].tolist() if view in clearances else [] for view in range(len(places))],
         "level": tour.level_axes.tolist(),
         "hysteresis": EDGE_HYSTERESIS,
-        "reach": REACH,
+        "reach": PageConstants().reach,
     }
     random = np.random.default_rng(0)
     positions = random.uniform((-1, -0.5, -1), (3, 0.5, 4), (60, 3))
@@ -457,5 +454,5 @@ def test_a_pose_is_moved_to_within_the_limits_and_must_be_finite(node: str, tmp_
         try { cameraFor({ yaw: "x" }); } catch (error) { return [far, error.message]; }
     }"""
     far, message = run(node, tmp_path, make_header(ROW, [(0, 1)], [0, 0, 0, 1]), program)
-    assert far["position"] == pytest.approx([2, 0, 1]) and far["fov"] == 110 and "finite" in message
+    assert far["position"] == pytest.approx([2, 0, 1]) and far["fov"] == 130 and "finite" in message
     assert far["pitch"] == pytest.approx(np.radians(89.9)) and far["yaw"] == 0

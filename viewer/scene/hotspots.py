@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.tours.links import find_link_ring
+from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.tour import TourScenes
 
-_RADIUS = 0.22  # metres, on the floor
 _MIN_PIXELS = 14.0  # of the radius within which a click is meant
 
 
@@ -51,7 +50,7 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
     feet = {
         node: (tour.positions[node] + below, tour.panoramas[node].label)
         for node in (here, *(seen if seen or links else flown[:1]))
-        if np.linalg.norm(tour.positions[node] - position) >= 3 * _RADIUS
+        if np.linalg.norm(tour.positions[node] - position) >= RING_DISTANCE
     }
     for node, link in links.items():
         if (node in hidden or tour.is_fade(here, node)) and node not in feet:
@@ -78,7 +77,7 @@ def _make_hotspot(
     """The hotspot of a panorama around a place on the floor; None if it is not in an image of this size."""
     right, _, forward = np.asarray(camera.level).T
     angles = np.arange(24) * (2 * np.pi / 24)
-    circle = foot + _RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
+    circle = foot + RING_RADIUS * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * forward)
     center = project_point(camera, tuple(foot), size)
     ring = [project_point(camera, tuple(corner), size) for corner in circle]
     if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
