@@ -2,12 +2,10 @@
 // OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world, moved by its
 // origin. Matrices are arrays of rows.
 
-import {
-  clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
-} from "./graph.js";
+import { clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
-const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
+const SOFT = 0.3; // of the way to the limit of the camera, in which steps become shorter
 
 // Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
 export function rotationOf({ yaw, pitch, roll }) {
@@ -94,7 +92,7 @@ export function floorPoint(position) {
   return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
 }
 
-const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
+const MIN_WEIGHT = 1e-4; // of a view: with it, the other views fill the holes of a view at its own camera
 
 // Weights of the views of a group in a picture of a position and a direction: blend_weights of pansplat. Other views
 // have weight 0.
@@ -107,7 +105,7 @@ function groupWeights(group, position, forward) {
     return (distances[i] > 0 ? nearest / distances[i] : 1) * Math.exp(HEADER.ahead * ahead);
   });
   const sum = closeness.reduce((a, b) => a + b);
-  views.forEach((view, i) => { weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT); });
+  for (const [i, view] of views.entries()) weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT);
   return weights;
 }
 
@@ -122,9 +120,9 @@ export function blendWeights({ position, rotation }) {
 // The views that are sorted fade in.
 export function showViews(step) {
   const { sorted } = state;
-  if (!sorted || !sorted.views.some((view) => shown[view] < 1)) return;
+  if (!sorted?.views.some((view) => shown[view] < 1)) return;
   const isFirst = !sorted.views.some((view) => shown[view] && HEADER.views[view].count);
-  sorted.views.forEach((view) => { shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1); });
+  for (const view of sorted.views) shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1);
   changed();
 }
 

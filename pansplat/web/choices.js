@@ -1,9 +1,9 @@
 // What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
 
-import { clamp, column, distanceOf, dot, minus } from "./graph.js";
+import { column, distanceOf, dot, minus } from "./graph.js";
 import { edges, GRAPH, parts } from "./state.js";
 
-const LEVEL_WAY = 0.1;    // metres, of a way whose heading is known
+const LEVEL_WAY = 0.1; // metres, of a way whose heading is known
 
 const isFlown = (from, to) => {
   return edges.length ? edges.some(([a, b]) => (a === from && b === to) || (a === to && b === from)) : parts[from] === parts[to];

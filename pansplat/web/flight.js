@@ -8,12 +8,12 @@ import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isFade, minus, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
 import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
-import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, parts, state } from "./state.js";
+import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, state } from "./state.js";
 
-const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into one
-const MAX_STILL = 8e6;              // pixels of its image
-const NEAR = HEADER.speed;          // metres: a second's walk
-export const PHOTO_WAIT_MS = 2000;  // for a photograph, at most: where a zoom ends, and of the first Gaussians
+const DOLL_SECONDS = 1.6; // of a flight out of the rooms, or into one
+const MAX_STILL = 8e6; // pixels of its image
+const NEAR = HEADER.speed; // metres: a second's walk
+export const PHOTO_WAIT_MS = 2000; // for a photograph, at most: where a zoom ends, and of the first Gaussians
 
 export function jump(position, { yaw, pitch }, isZoom = false) {
   takeStill(isZoom);
@@ -21,7 +21,7 @@ export function jump(position, { yaw, pitch }, isZoom = false) {
 }
 
 function place(pose) {
-  if (state.doll.isOn) setDoll(false);  // before the pose, which may have a field of view
+  if (state.doll.isOn) setDoll(false); // before the pose, which may have a field of view
   Object.assign(camera, pose);
   state.headset.turnTo(camera.yaw);
   settleAt(camera.position);
@@ -142,7 +142,7 @@ function planWay(spot) {
   let from = isThere ? here : null, position = [...camera.position], end = chooseArrival(spot, camera);
   way.forEach((node, i) => {
     const before = i > 0 ? way[i - 1] : null, isZoom = before !== null && isFade(GRAPH, before, node);
-    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node);  // a zoom begins where the camera is
+    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node); // a zoom begins where the camera is
     if (node === from || isLeft) return;
     const heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || camera;
     if (heading) legs.push({ view: { yaw: heading.yaw, pitch: heading.pitch } });
@@ -161,7 +161,7 @@ export function advanceFlight(now) {
   if (flight.began === null) beginLeg(leg, now);
   const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1, step = ease(t) - leg.done;
   leg.done = ease(t);
-  if (leg.turn) turn(leg.turn[0] * step, leg.turn[1] * step);  // a drag adds to it
+  if (leg.turn) turn(leg.turn[0] * step, leg.turn[1] * step); // a drag adds to it
   if (leg.path) camera.position = t < 1 ? plus(leg.path[0], scaled(minus(leg.path[1], leg.path[0]), leg.done)) : [...leg.path[1]];
   if (leg.path) changed();
   if (t < 1) return;
@@ -169,7 +169,7 @@ export function advanceFlight(now) {
   flight.began = null;
   flight.legs.shift();
   if (flight.legs.length) {
-    if (!leg.seconds && leg.to === undefined) advanceFlight(now);  // a zoom begins with the picture at rest, which has the full resolution
+    if (!leg.seconds && leg.to === undefined) advanceFlight(now); // a zoom begins with the picture at rest, which has the full resolution
     return;
   }
   state.flight = null;
@@ -184,7 +184,7 @@ function beginLeg(leg, now) {
   leg.seconds = leg.rest || 0;
   const [least, most] = HEADER.flightSeconds;
   if (leg.path) leg.seconds = clamp(least + HEADER.metreSeconds * (distanceOf(...leg.path) - HEADER.shortFlight), least, most);
-  else if (leg.view && leg.to === undefined && !state.headset.session) {  // the head turns itself
+  else if (leg.view && leg.to === undefined && !state.headset.session) { // the head turns itself
     const { yaw, pitch } = leg.view, across = yaw - camera.yaw;
     leg.turn = [Math.atan2(Math.sin(across), Math.cos(across)), pitch - camera.pitch];
     leg.seconds = HEADER.turnSeconds * Math.min(Math.hypot(...leg.turn) / HEADER.turnAngle, 1);
@@ -192,7 +192,7 @@ function beginLeg(leg, now) {
 }
 
 export function setTouring(value) {
-  if (state.doll.isDue) setDoll(false);  // another way replaces it
+  if (state.doll.isDue) setDoll(false); // another way replaces it
   state.isTouring = value && HEADER.spots.length > 1;
   if (state.isTouring && state.doll.isOn) jump(GRAPH.positions[state.doll.node], state.doll.heading);
   byId("play").setAttribute("aria-pressed", state.isTouring);
@@ -237,10 +237,10 @@ export function takeStill(isZoom = false) {
   if (!state.renderer || !state.sorted) return;
   const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * HEADER.zoom * camera.fov * DEGREE) : 1;
   state.still = { taken: null, began: null, left: 1, position: null, isZoom, zoom };
-  if (state.headset.session) return;  // it fades from black
+  if (state.headset.session) return; // it fades from black
   const full = fullSize(), larger = photographs.isOpaque ? Math.max(Math.min(zoom, Math.sqrt(MAX_STILL / (full[0] * full[1]))), 1) : 1;
   const size = full.map((side) => Math.round(side * larger)), isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
-  drawAt(...(photographs.isOpaque || isZoom ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
+  drawAt(...(photographs.isOpaque || isZoom ? size : [canvas.width, canvas.height])); // it can be copied in the task that drew it
   const context = stillCanvas.getContext("2d");
   context.globalAlpha = stillCanvas.hidden || !isSame ? 1 : 1 - Number(stillCanvas.style.opacity);
   if (!isSame) [stillCanvas.width, stillCanvas.height] = size;

@@ -10,6 +10,7 @@ export const DEGREE = Math.PI / 180;
 
 export const minus = (a, b) => a.map((value, i) => value - b[i]);
 export const plus = (a, b) => a.map((value, i) => value + b[i]);
+/** @type {(a: number[], factor: number) => any} */
 export const scaled = (a, factor) => a.map((value) => value * factor);
 export const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 export const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
@@ -104,7 +105,7 @@ export const isFade = (graph, from, to) => {
 // find_way
 export function findWay(graph, position, node, part = null) {
   const ends = graph.edges[nearestEdge(graph, position, part)].slice(0, 2), [from, to] = ends.map((end) => distanceOf(graph.positions[end], position));
-  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1];  // no camera flies to the other end
+  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1]; // no camera flies to the other end
   const ways = ends.map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);

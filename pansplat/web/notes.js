@@ -9,17 +9,17 @@ import { camera, GRAPH, state } from "./state.js";
 let markers = [];
 
 export function makeNotes() {
-  markers = HEADER.spots.flatMap(({ notes }, node) => notes.map(({ direction, text, addresses }) => {
-    const button = make("button", "note", "i");
-    button.hidden = true;
-    button.title = button.ariaLabel = `Information: ${text.split("\n")[0] || addresses[0]}`;
-    button.onclick = () => explain(text, addresses.map((address) => {
-      const link = make("a", "", address);
-      return Object.assign(link, { href: address, target: "_blank", rel: "noopener noreferrer" });
-    }));
-    byId("spots").append(button);
-    return { node, direction, button };
-  }));
+  markers = HEADER.spots.flatMap(({ notes }, node) =>
+    notes.map(({ direction, text, addresses }) => {
+      const button = make("button", "note", "i");
+      button.hidden = true;
+      button.title = button.ariaLabel = `Information: ${text.split("\n")[0] || addresses[0]}`;
+      const links = addresses.map((href) => Object.assign(make("a", "", href), { href, target: "_blank", rel: "noopener noreferrer" }));
+      button.onclick = () => explain(text, links);
+      byId("spots").append(button);
+      return { node, direction, button };
+    })
+  );
 }
 
 // `toWindow`: from camera axes.

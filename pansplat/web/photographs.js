@@ -7,16 +7,20 @@ import { clamp, column, distanceOf, dot, minus, multiply, scaled } from "./graph
 import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
-const DENSITY = 1.3;                // texels of a pixel in the middle of a face, at least
-const KEPT = 3;                     // photographs whose textures are kept
-const AT_ONCE = 6;                  // tiles that are read at the same time
-const SMALL_FACE = 2048;            // largest face on a phone, texels
+const DENSITY = 1.3; // texels of a pixel in the middle of a face, at least
+const KEPT = 3; // photographs whose textures are kept
+const AT_ONCE = 6; // tiles that are read at the same time
+const SMALL_FACE = 2048; // largest face on a phone, texels
 // Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
 const FACES = [
-  [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4], [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0], [[-1, 0, 0], [0, 1, 0], [0, 0, -1], 5],
-  [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1], [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2], [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
+  [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4],
+  [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0],
+  [[-1, 0, 0], [0, 1, 0], [0, 0, -1], 5],
+  [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1],
+  [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2],
+  [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
-const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
+const texts = new Map(); // of a page in one file: base64 of the tiles that have arrived
 
 // In a page of one file there is a script for the smallest tiles of a photograph and one for the others; they are in the
 // element before.
@@ -32,7 +36,7 @@ async function readTile({ key, tries }) {
     try {
       return await createImageBitmap(await fetchFile(`${key}.jpg`, tries > 0));
     } catch {
-      throw new Error(`${key}.jpg is missing, or is no tile`);  // a web server may answer with a page
+      throw new Error(`${key}.jpg is missing, or is no tile`); // a web server may answer with a page
     }
   }
   const image = new Image();
@@ -44,8 +48,12 @@ async function readTile({ key, tries }) {
 // One size of a photograph. `status` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
 // the time of the next one.
 class Level {
+  texture = null;
+  isFresh = true;
+  tiles = [];
+
   constructor(name, rotation, first, [size, step]) {
-    Object.assign(this, { size, texture: null, isFresh: true, tiles: [] });
+    this.size = size;
     const count = Math.ceil(size / step);
     FACES.forEach(([right, down, forward, face]) => {
       for (let row = 0; row < count; row++) {
@@ -54,7 +62,8 @@ class Level {
           const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
           const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
           const reach = Math.atan(Math.SQRT2 * step / size);
-          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, status: null, tries: 0, due: 0 });
+          const key = `${name}_${first + this.tiles.length}`, place = { face, x: across * step, y: row * step };
+          this.tiles.push({ key, ...place, direction, reach, status: null, tries: 0, due: 0 });
         }
       }
     });
@@ -96,9 +105,15 @@ class Level {
 }
 
 class Photographs {
-  constructor() {
-    Object.assign(this, { opacity: 0, target: 0, node: null, wanted: null, last: null, reading: 0, made: new Map(), renderer: null });
-  }
+  opacity = 0;
+  target = 0;
+  node = null;
+  wanted = null;
+  last = null;
+  reading = 0;
+  made = new Map();
+  renderer = null;
+  program = null;
 
   // Whether nothing else is seen.
   get isOpaque() {
@@ -177,7 +192,7 @@ class Photographs {
   // Reads what the photograph at the camera needs, or that where a flight ends, and fades; `seconds` after the last time.
   update(seconds, size = fullSize()) {
     if (!HEADER.photographs.length || !state.renderer) return;
-    if (this.renderer !== state.renderer) {  // the graphics were lost
+    if (this.renderer !== state.renderer) { // the graphics were lost
       this.made.clear();
       Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph), opacity: 0 });
     }
@@ -194,7 +209,7 @@ class Photographs {
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
-    const step = state.still?.began === null ? 1 : seconds / HEADER.stopSeconds;  // the still covers it
+    const step = state.still?.began === null ? 1 : seconds / HEADER.stopSeconds; // the still covers it
     this.opacity = clamp(this.target, this.opacity - step, this.opacity + step);
     changed();
   }

@@ -53,14 +53,14 @@ def test_modules_that_need_no_browser_import_no_others() -> None:
         assert {other for _, other in IMPORT.findall(MODULES[name])} <= set(WITHOUT_BROWSER)
 
 
-def test_the_modules_read_the_fields_of_the_header_and_all_of_them() -> None:
+def test_the_modules_read_all_fields_of_the_header() -> None:
     fields = {field.encode_name for field in msgspec.structs.fields(PageHeader)}
     read = {name for text in MODULES.values() for name in re.findall(r"\bHEADER\.(\w+)", text)}
     for text in MODULES.values():
         for names in re.findall(r"\{((?:[^{}]|\{[^{}]*\})*)\} = HEADER\b(?!\.)", text):
             read |= set(re.findall(r"\w+", re.sub(r": \{[^{}]*\}", "", names)))
     graph = {"next", "poor", "hysteresis", "reach", "positions"}  # of GRAPH, which is HEADER with `positions`
-    assert read <= fields and fields - read <= graph
+    assert fields - read <= graph
 
 
 @pytest.fixture(scope="module")
@@ -78,16 +78,6 @@ def node() -> str:
             pytest.fail("CI needs playwright (pip install -e '.[dev]')")
         pytest.skip("needs playwright (pip install -e '.[dev]') or node")
     return program
-
-
-def test_every_name_that_a_module_imports_is_exported(node: str, tmp_path: Path) -> None:
-    """Node links all modules before it runs the first one, which needs HEADER."""
-    (tmp_path / "package.json").write_text('{"type": "module"}')
-    for wrong, error in (("", "ReferenceError"), ('import { nothing } from "./graph.js";\n', "SyntaxError")):
-        for name, text in (MODULES | {"page.js": wrong + MODULES["page.js"]}).items():
-            (tmp_path / name).write_text(text)
-        done = subprocess.run([node, tmp_path / "page.js"], capture_output=True, text=True, timeout=120)
-        assert re.findall(r"^(?:\w*Error)\b", done.stderr, re.MULTILINE) == [error], done.stderr
 
 
 def run(node: str, folder: Path, header: dict[str, Any], program: str, *values: Any) -> Any:
