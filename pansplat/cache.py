@@ -15,7 +15,7 @@ from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.system.store import Store, hash_parts
 
-_MAX_LEVELS = 256  # of Gaussians; their labels are bytes
+_MAX_LEVELS = 256  # levels of Gaussians that an entry can have; their labels are bytes
 
 
 @dataclass(frozen=True, eq=False)

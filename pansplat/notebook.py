@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from pansplat.inputs.views import Views
     from pansplat.rendering import Rendering
 
-DISPLAY_GAUSSIANS = 100_000  # of a scene in a notebook: 2.4 MB of its file
-_FRAME_HEIGHT = 480  # pixels, of a scene
-_MERGE_SIZE = 128, 256  # pixels, of the images that find what Gaussians contribute
+DISPLAY_GAUSSIANS = 100_000  # Gaussians of a scene that a notebook shows: 2.4 MB of its file
+_FRAME_HEIGHT = 480  # rows of the frame that shows a scene
+_MERGE_SIZE = 128, 256  # rows and columns of the images that find what Gaussians contribute
 _MAX_MERGERS = 8  # Gaussians that become one on average; more take up to half a minute
-_MAX_WIDTH = 1024  # pixels, of a picture
-_MAX_PICTURES = 4  # of the panoramas of an object; the others are named in its text
-_JPEG_QUALITY = 85  # of pictures in a notebook
+_MAX_WIDTH = 1024  # columns of the widest picture
+_MAX_PICTURES = 4  # panoramas of an object that are shown; its text names the others
+_JPEG_QUALITY = 85  # JPEG quality of pictures in a notebook
 _POSTER = re.compile(r'src="data:image/jpeg;base64,([^"]+)"')
 _BUNDLE = dict[str, str]  # data by MIME type; pictures in base64
 

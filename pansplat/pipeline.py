@@ -78,15 +78,15 @@ __all__ = [
 
 Drawing = Literal["exact", "original"]
 
-_DEFAULT_HEIGHT = 512  # of networks; larger panoramas take minutes
-_MAX_CACHED_HEIGHT = 512  # of predictions of networks; taller ones are written tile by tile
+_DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
+_MAX_CACHED_HEIGHT = 512  # rows of a network's prediction that is cached; taller ones are written tile by tile
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
-_GAUSSIANS_PER_SQUARE = 0.75  # of a panorama, over the square of its height; about those of the default model
-_BRIGHTEST = 1.5  # value of an image in [0, 1], after any filter
-_PIXEL_SECONDS = 2e-7  # of an image of a scene of a pair, on two cores (docs/bench_raster.md)
-_REFINE_STEPS = 40  # that take about 10 s of a pair on two cores; more change little
-_JOINT_STEPS, _MIN_STEPS = 80, 8  # of joint drawing, about 20 s; at least, for each photograph
-_STEP_SECONDS = 0.25  # of a step on two cores
+_GAUSSIANS_PER_SQUARE = 0.75  # Gaussians of a panorama over the square of its rows; about those of the default model
+_MAX_COLOR = 1.5  # largest value of images in [0, 1], which filters may exceed; images of 8 bits have larger ones
+_PIXEL_SECONDS = 2e-7  # time of a pixel of an image of a pair's scene, on two cores (docs/bench_raster.md)
+_REFINE_STEPS = 40  # steps that take about 10 s of a pair on two cores; more change little
+_JOINT_STEPS, _MIN_STEPS = 80, 8  # steps of joint drawing, about 20 s; least for each photograph (docs/refinement.md)
+_STEP_SECONDS = 0.25  # time of a step on two cores
 _MAX_MERGED = 4  # Gaussians that become one on average
 
 
@@ -405,7 +405,7 @@ def _predict_views(task: _Task) -> Scene:
         return _make_scene(content, task)
     views = task.views
     gaussians = task.predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks)
-    assert isinstance(gaussians, Gaussians)  # only a batch of inputs gives a list
+    assert isinstance(gaussians, Gaussians)  # a list would be the result of a batch
     content = CachedScene(gaussians)
     cached.write(content)
     return _make_scene(content, task)
@@ -503,7 +503,7 @@ def _refine_scene(
     except torch.cuda.OutOfMemoryError:
         if device == given:
             raise
-        note_full_card("refinement")  # outside of the block the card's tensors are free
+        note_full_card("refinement")  # the tensors on the card are free outside of the block
     return run_on(given)
 
 
@@ -536,7 +536,7 @@ def predict_tour(
     warn_of_single_views(tour, predictor)
     max_views, is_refined = find_max_views(predictor), options.joint and options.refine_steps != 0
     total = len(tour.choose_sources(max_views))
-    part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # of a panorama
+    part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # limit of Gaussians of a panorama
     counter = itertools.count(1)
     each = replace(options, joint=False, refine_steps=0) if options.joint else options
 
@@ -782,7 +782,7 @@ def _load_source(source: Pair | Views | str | Path) -> Pair | Views:
 def _as_tensors(views: Views) -> Views:
     images, masks = torch.as_tensor(views.images), torch.as_tensor(views.masks, dtype=torch.bool)
     images = images / 255 if images.dtype == torch.uint8 else images.float()
-    if images.numel() and float(images.nan_to_num().max()) > _BRIGHTEST:
+    if images.numel() and float(images.nan_to_num().max()) > _MAX_COLOR:
         raise InputError(
             f"`images` must be RGB in [0, 1], got values up to {float(images.max()):g}; divide them by 255"
         )
@@ -814,7 +814,7 @@ def _make_scene(content: CachedScene, task: _Task, joint: bool = False) -> Scene
     source, gaussians, cam2world = task.source, content.gaussians, task.cam2world.double()
     panoramas = source.context if isinstance(source, Pair) else ()
     first = source if isinstance(source, Views) else source.context[0]
-    if len(cam2world) == 1:  # predicted as of a camera at the usual height
+    if len(cam2world) == 1:  # it is predicted as if the camera stood at the usual height
         gaussians = gaussians.scaled(first.camera_height / CAMERA_HEIGHT, cam2world[0, :3, 3])
     return Scene(
         gaussians,

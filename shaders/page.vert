@@ -24,7 +24,7 @@ bool is_ball_outside(vec3 mean, float opacity, vec3 scale) {
     vec3 center = world_to_camera * offset;
     float reach = sqrt(2.0 * log(max(opacity / ALPHA_CUT, 1.0)));
     float largest = max(scale.x, max(scale.y, scale.z));
-    float radius = 1.001 * reach * (largest + sqrt(filter_variance) * length(offset)) + 1e-5 * length(offset);
+    float radius = 1.001 * reach * (largest + sqrt(filter_variance) * length(offset) + length(shift)) + 1e-5 * length(offset);
     for (int i = 0; i < 4; i++) {
         if (dot(sides[i], center) < -radius) return true;
     }
@@ -36,12 +36,13 @@ bool is_ball_outside(vec3 mean, float opacity, vec3 scale) {
 bool is_cone_outside(Gaussian gaussian, Footprint f) {
     vec3 n = world_to_camera * ((gaussian.mean - position) / f.distance);
     mat3 unit = world_to_camera * rotation_from_quat(gaussian.quat);
-    vec3 k = gaussian.scale / f.distance;
+    vec3 k = gaussian.scale / f.distance, m = find_motion(n, f.distance);
     float kappa = 2.0 * log(f.peak / ALPHA_CUT) + 1e-3;
     for (int i = 0; i < 4; i++) {
         float height = dot(sides[i], n);
         vec3 across = (sides[i] * unit) * k;
-        float variance = dot(across, across) + filter_variance * (1.0 - height * height);
+        float motion = dot(sides[i], m);
+        float variance = dot(across, across) + filter_variance * (1.0 - height * height) + motion * motion;
         if (height < 0.0 && height * height > kappa * variance) return true;
     }
     return false;

@@ -7,6 +7,7 @@ uniform float near;              // smallest radial distance, metres
 uniform float filter_variance;   // e^2 of section 2
 uniform vec2 half_size;          // half the image; of one off the optical axis, half the smallest one around both
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
+uniform vec3 shift;              // of the camera during the exposure, its axes, metres / sqrt(12); zero at rest
 
 struct Gaussian {
     vec3 mean;
@@ -34,6 +35,12 @@ mat3 rotation_from_quat(vec4 quat) {
         1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
         2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
         2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+// How a Gaussian in the unit direction n moves across the ray during the exposure, camera axes, radians / sqrt(12): its
+// covariance grows by m m', that of a line.
+vec3 find_motion(vec3 n, float radius) {
+    return (dot(n, shift) * n - shift) / radius;
 }
 
 // Sets the quad to the half axes of the ellipse x' E^-1 x = 1, E = [xx xy; xy yy], lengthened by the margin.
@@ -66,8 +73,9 @@ vec2 find_range(float d_xx, float d_xz, float d_zz, vec2 n, float limit) {
 }
 
 // Sets the rows of the exact response, and the quad. `axes`: the half axes in camera axes, divided by the distance;
-// `u v`: the tangent frame at the unit direction n; `b2`: the filtered block (B_uu, B_uv, B_vv).
-bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 b2, float determinant, vec2 c) {
+// `u v`: the tangent frame at the unit direction n; `m`: the motion; `b2`: the filtered block (B_uu, B_uv, B_vv).
+bool set_footprint_ray(
+    inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec3 m, vec3 b2, float determinant, vec2 c) {
     float root_u = sqrt(b2.x), root_v = sqrt(determinant / b2.x);
     float shear = b2.y / b2.x;
     vec3 a = u / root_u;
@@ -89,9 +97,9 @@ bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec
     vec3 y = vec3(axes[0].y, axes[1].y, axes[2].y);
     vec3 z = vec3(axes[0].z, axes[1].z, axes[2].z);
     float e2 = filter_variance;
-    float c_xx = dot(x, x) + e2 * (1.0 - n.x * n.x), c_xy = dot(x, y) - e2 * n.x * n.y;
-    float c_yy = dot(y, y) + e2 * (1.0 - n.y * n.y), c_yz = dot(y, z) - e2 * n.y * n.z;
-    float c_zz = dot(z, z) + e2 * (1.0 - n.z * n.z), c_xz = dot(x, z) - e2 * n.x * n.z;
+    float c_xx = dot(x, x) + e2 * (1.0 - n.x * n.x) + m.x * m.x, c_xy = dot(x, y) - e2 * n.x * n.y + m.x * m.y;
+    float c_yy = dot(y, y) + e2 * (1.0 - n.y * n.y) + m.y * m.y, c_yz = dot(y, z) - e2 * n.y * n.z + m.y * m.z;
+    float c_zz = dot(z, z) + e2 * (1.0 - n.z * n.z) + m.z * m.z, c_xz = dot(x, z) - e2 * n.x * n.z + m.x * m.z;
     float d_zz = n.z * n.z - kappa * c_zz;
     if (d_zz < 1e-3) {
         // The ellipsoid crosses the plane z = 0, or all of it is behind the camera.
@@ -105,9 +113,10 @@ bool set_footprint_ray(inout Footprint f, mat3 axes, vec3 n, vec3 u, vec3 v, vec
     }
     if (n.z < 0.0) return false;
     vec3 h_x = n.z * x - n.x * z, h_y = n.z * y - n.y * z;
-    float e_xx = dot(h_x, h_x) + e2 * (n.z * n.z + n.x * n.x) + kappa * (c_xz * c_xz - c_xx * c_zz);
-    float e_yy = dot(h_y, h_y) + e2 * (n.z * n.z + n.y * n.y) + kappa * (c_yz * c_yz - c_yy * c_zz);
-    float e_xy = dot(h_x, h_y) + e2 * n.x * n.y + kappa * (c_xz * c_yz - c_xy * c_zz);
+    vec2 h_m = n.z * m.xy - m.z * n.xy;
+    float e_xx = dot(h_x, h_x) + h_m.x * h_m.x + e2 * (n.z * n.z + n.x * n.x) + kappa * (c_xz * c_xz - c_xx * c_zz);
+    float e_yy = dot(h_y, h_y) + h_m.y * h_m.y + e2 * (n.z * n.z + n.y * n.y) + kappa * (c_yz * c_yz - c_yy * c_zz);
+    float e_xy = dot(h_x, h_y) + h_m.x * h_m.y + e2 * n.x * n.y + kappa * (c_xz * c_yz - c_xy * c_zz);
     float scale = kappa / (d_zz * d_zz);
     f.center = (n.xy * n.z - kappa * vec2(c_xz, c_yz)) / d_zz;
     set_quad(f, scale * e_xx, scale * e_xy, scale * e_yy);
@@ -132,13 +141,16 @@ bool project_gaussian(Gaussian gaussian, out Footprint f) {
     float e2 = filter_variance;
     float trace = dot(u_a, u_a) + dot(v_a, v_a);
     float sharp = dot(w2, n_e * n_e);
-    float determinant = sharp + e2 * trace + e2 * e2;
-    f.peak = gaussian.opacity * sqrt(sharp / determinant);  // the filter conserves energy
+    vec3 m = find_motion(n, f.distance), across = cross(n, m) * axes, m_e = m * unit;
+    float determinant = sharp + e2 * trace + e2 * e2 + dot(across, across) + e2 * dot(m, m);
+    f.peak = gaussian.opacity * sqrt(sharp / determinant);  // the filter and the motion conserve energy
     if (!(f.peak >= ALPHA_CUT)) return false;
 
     float volume = k.x * k.y * k.z;
     float along = e2 * e2 * dot(n_a, n_a) + e2 * dot(w2, u_e * u_e + v_e * v_e) + volume * volume;
+    along += dot(w2, m_e * m_e) + e2 * dot(m, m) * dot(n_a, n_a);
     f.thickness = along / determinant;
-    vec3 b2 = vec3(dot(u_a, u_a) + e2, dot(u_a, v_a), dot(v_a, v_a) + e2);
-    return set_footprint_ray(f, axes, n, u, v, b2, determinant, vec2(dot(u_a, n_a), dot(v_a, n_a)));
+    vec2 m_a = vec2(dot(u, m), dot(v, m));
+    vec3 b2 = vec3(dot(u_a, u_a) + e2, dot(u_a, v_a), dot(v_a, v_a) + e2) + m_a.xxy * m_a.xyy;
+    return set_footprint_ray(f, axes, n, u, v, m, b2, determinant, vec2(dot(u_a, n_a), dot(v_a, n_a)));
 }

@@ -304,4 +304,4 @@ def small_config() -> Any:
 @pytest.fixture
 def any_state(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last state of a refinement is kept: random images say nothing about pictures between the cameras."""
-    monkeypatch.setattr("pansplat.refinement.refinement._ALLOWANCE", 1e9)
+    monkeypatch.setattr("pansplat.refinement.refinement._MAX_ERROR_RATIO", 1e9)

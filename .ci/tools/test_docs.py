@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
 BLOCKS = "\n".join(re.findall(r"^```\w*\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE))
 COMMANDS = re.findall(r"^(?:\.venv/bin/)?pansplat (.+?)(?:\s+#.*)?$", BLOCKS, flags=re.MULTILINE)
+COMMANDS += re.findall(r"`pansplat ([^`]+)`", README)  # those of the table
 SHADERS = ROOT / "shaders"
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Header = Mapping[str, Any]
 
-_WIDTH = 210  # characters of a printed line if there is no terminal
-MEAN = "mean"  # scene of the rows that average all others
+_WIDTH = 210  # characters of a printed line without a terminal
+MEAN = "mean"  # name of the scene in rows that average all others
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _PACKAGES = ("pansplat", "torch", "numpy", "numba")
 
@@ -186,7 +186,7 @@ def measure_peak_memory(call: Callable[[], T], device: torch.device) -> tuple[di
 
 def _reset_resident_peak() -> bool:
     """Return freed memory to the system and restart the high-water mark; False if there is none (not Linux)."""
-    if sys.platform == "win32":  # where the libraries of the process have no common handle
+    if sys.platform == "win32":  # there, the libraries of the process have no common handle
         return False
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:

@@ -138,7 +138,7 @@ def measure_case(
         return matched.depths.depth[-1][0].clone(), gaussians
 
     workload_s, cpu = time_workload(), torch.device("cpu")
-    release_idle_memory()  # buffers that numba keeps
+    release_idle_memory()  # numba keeps buffers
     taken, (timing, (depth, gaussians)) = measure_peak_memory(lambda: time_call(predict, cpu), cpu)
     scene = Scene(gaussians, views.cam2world.double(), views.near, views.far, height=views.images.shape[-2])
     image = render(scene, scene.pose_between(0.5), backend="numba").color
@@ -248,7 +248,7 @@ def _random_weight(name: str, like: Tensor, generator: torch.Generator) -> Tenso
     if not like.is_floating_point():
         return torch.full(like.shape, 100, dtype=like.dtype)
     if like.dim() == 0:
-        return torch.full((), 10.0)  # the monocular network's largest depth, metres
+        return torch.full((), 10.0)  # the largest depth of the monocular network, metres
     if name.endswith("running_var") or (name.endswith("weight") and like.dim() == 1):
         return 0.5 + torch.rand(like.shape, generator=generator)
     numbers = torch.randn(like.shape, generator=generator)

@@ -35,8 +35,8 @@ from pansplat.poses.solvers import angle_between, rotation_angle
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_WRONG_ROTATION, _WRONG_DIRECTION = 3.0, 10.0  # degrees, of a pair
-_WRONG_TURN, _WRONG_PLACE = 5.0, 30.0  # degrees and centimetres, of a tour
+_WRONG_ROTATION, _WRONG_DIRECTION = 3.0, 10.0  # degrees; a pair with larger errors is wrong
+_WRONG_TURN, _WRONG_PLACE = 5.0, 30.0  # degrees and centimetres; a tour's camera with larger errors is wrong
 
 
 def measure_folder(path: Path, *, camera_height: float, pairs: bool, tours: bool) -> Iterator[Row]:

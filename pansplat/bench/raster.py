@@ -52,11 +52,11 @@ if TYPE_CHECKING:
 Precision = Literal["float32", "float64"]
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
-_MIN_REPEATS, _MAX_REPEATS = 3, 15  # of fast cases
+_MIN_REPEATS, _MAX_REPEATS = 3, 15  # images that are timed, at least, and of fast cases at most
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
-_MAX_CHOICE_HEIGHT = 512  # pixels: each layout needs a float64 reference
+_MAX_CHOICE_HEIGHT = 512  # rows; each layout needs a float64 reference
 _MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
-_MAX_PSNR = 160.0  # dB, of a plotted point
+_MAX_PSNR = 160.0  # dB; better ones are plotted here
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ def _measure_group(
         entries = {"suite": group.suite, "scene": scene.name, **asdict(case), "layout_name": case.layout_name}
         row = Row({**entries, "is_reference": case.precision == "float64"}, {"num_gaussians": len(gaussians)})
         render = _prepare(case, "forward", gaussians, scene.pose)
-        release_idle_memory()  # buffers that numba keeps for the next image
+        release_idle_memory()  # numba keeps buffers for the next image
         with torch.no_grad():
             peak, (forward, color) = measure_peak_memory(lambda r=render, d=case.device: time_call(r, d), case.device)
         first = {"forward": forward} | (
@@ -324,7 +324,7 @@ def plot_choices(rows: Sequence[Row], header: Header) -> Figure | None:
         x, y = [row.get("forward_ms") for row in group], [min(_MAX_PSNR, row.get("psnr_db")) for row in group]
         axes.plot(x, y, _MARKERS[backend], label=f"{backend}, {layout}")
         for row, *point in zip(group, x, y, strict=True):
-            above = len(axes.texts) % 2  # in turns
+            above = len(axes.texts) % 2  # labels are above and below in turns
             axes.annotate(
                 row.get("kernel"), point, xytext=(6, 5 if above else -11), textcoords="offset points", fontsize=7
             )

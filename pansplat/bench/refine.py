@@ -77,7 +77,7 @@ def list_refine_cases(*, quick: bool) -> list[RefineCase]:
     return cases + [RefineCase("default", 512, 40, count) for count in (50_000, 100_000, 200_000)]
 
 
-_ENTRIES = ("suite", *RefineCase.__dataclass_fields__)  # of a mean over the pairs
+_MEAN_ENTRIES = ("suite", *RefineCase.__dataclass_fields__)  # entries of the rows of means over the pairs
 
 
 def measure_refine(pairs: Sequence[Pair], cases: Sequence[RefineCase], lpips: Lpips | None) -> Iterator[Row]:
@@ -112,7 +112,7 @@ def measure_refine(pairs: Sequence[Pair], cases: Sequence[RefineCase], lpips: Lp
 
 
 def _average(rows: Sequence[Row]) -> list[Row]:
-    means = average_rows(rows, _ENTRIES)
+    means = average_rows(rows, _MEAN_ENTRIES)
     return [Row({"suite": "refine", "scene": MEAN, **row.case}, row.values) for row in means]
 
 

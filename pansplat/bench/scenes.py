@@ -15,7 +15,7 @@ from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 
 NUM_LEVELS = 4
-_BASELINE = 1.0  # metres
+_BASELINE = 1.0  # metres between the two cameras
 _CHUNK = 1 << 17  # rays that are cast at once
 
 # Corners of the room, then of its furniture, metres; the cameras are 1.2 m above the floor (y points down).
@@ -31,9 +31,9 @@ _FURNITURE = (
 )
 NUM_SURFACES = 6 * (1 + len(_FURNITURE))
 _FOOTPRINT = (0.5, 1.0)  # standard deviations of discs across the line of sight, in pixels of their level
-_MAX_STRETCH = 4.0  # of a disc seen at a slant
-_THICKNESS = 0.1  # of a disc's width
-_OPACITY = (0.3, 0.95)  # smallest and largest
+_MAX_STRETCH = 4.0  # largest ratio of the axes of a disc seen at a slant
+_THICKNESS = 0.1  # thickness of a disc relative to its width
+_OPACITY = (0.3, 0.95)  # opacities of the discs: smallest and largest
 
 
 def make_room_cameras(views: int = 2) -> Float[Tensor, "view 4 4"]:
@@ -145,5 +145,5 @@ def _paint(
     palette = torch.rand(int(surface.max()) + 1, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     stripes = torch.sin(9 * points).prod(dim=1) + 0.5 * torch.sin(70 * points).prod(dim=1)
     grain = 0.05 * torch.randn(len(points), 3, generator=generator, dtype=torch.float64)
-    torch.randn(len(points), 3, generator=generator)  # so that the room stays that of earlier figures
+    torch.randn(len(points), 3, generator=generator)  # unused; the room stays that of earlier figures
     return (2.4 * (palette[surface] - 0.5) + 0.5 * stripes[:, None] + grain).float()[:, None]

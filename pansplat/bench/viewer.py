@@ -46,7 +46,7 @@ RENDERERS = ("cpu", "gl")
 _PANORAMA_SIZE = (1024, 512)  # pixels
 _MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
 _VIEWER_PACKAGE = "pansplat_viewer"
-_RATES = (15, 60)  # frames per second, lines of the plot
+_RATES = (15, 60)  # lines of the plot, frames per second
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def measure_viewer(height: int, cases: Sequence[ViewerCase], *, repeats: int, th
 
 def run_viewer(job: Path, threads: int) -> list[str]:
     """The lines that the viewer's command prints for a job."""
-    environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # of Mesa's software OpenGL
+    environment = os.environ | {"LP_NUM_THREADS": str(threads)}  # threads of Mesa's software OpenGL
     command = [sys.executable, "-m", f"{_VIEWER_PACKAGE}.draw.timing", str(job)]
     ended = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", errors="replace")
     if ended.returncode:

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 STEPS = ("predict", "refine", "export")
 REPORT_NAME = "report.jsonl"
 _PROGRAM, _PROGRAM_SUFFIXES = ("pansplat.web", "pansplat.shaders"), (".js", ".html", ".css", ".glsl", ".vert", ".frag")
-_MAX_NAME = 40  # letters of a pair's name in the name of an output
-_MEMORY = 4 << 30  # bytes of a worker; decides the default number of workers
+_MAX_NAME = 40  # letters of a pair's name that the name of an output repeats
+_WORKER_MEMORY = 4 << 30  # bytes that a worker needs, for the default number of workers
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ class Batch(Computation):
             raise InputError(
                 "pansplat batch: needed the package distributed, got none; run pip install 'pansplat[cluster]'"
             )
-        import locket  # Dask needs it, too
+        import locket  # Dask needs locket, too
 
         items, model, network = list_items(self.path), self.prediction.model, self.prediction.depth_network
         if Path(model).suffix != "":
-            model = str(expand_home(model).absolute())  # of workers in other folders
+            model = str(expand_home(model).absolute())  # workers may run in other folders
         chosen = {"model": model, "depth_network": network and expand_home(network).absolute()}
         batch = replace(self, out=report.parent, prediction=replace(self.prediction, **chosen))
-        fingerprint_work(batch.prediction)  # an unknown model is an error of the command, not of each item
+        fingerprint_work(batch.prediction)  # an unknown model is an error of the command instead of each item
         batch.out.mkdir(parents=True, exist_ok=True)
         try:
             with locket.lock_file(str(batch.out / ".lock"), timeout=0):
@@ -217,14 +217,14 @@ def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict
                 for path in folder.glob(f"{step}-{'[0-9a-f]' * 16}-*"):
                     if path not in files and path.name.partition(".")[2] == suffix:
                         path.unlink()
-        except Exception as problem:  # whatever it is, other items go on
+        except Exception as problem:  # whatever the problem is, other items go on
             error = _describe(problem)
     return {
         "item": item[0],
         "status": "failed" if error else "done" if num_made else "skipped",
         "seconds": round(time.perf_counter() - began, 3),
         "outputs": [path.relative_to(batch.out).as_posix() for path in files],
-        "notes": list(dict.fromkeys(" ".join(note.splitlines()) for note in notes)),  # each step reads the folder
+        "notes": list(dict.fromkeys(" ".join(note.splitlines()) for note in notes)),  # steps repeat some
         "error": error,
     }
 
@@ -272,7 +272,7 @@ def start_workers(workers: int | None = None) -> Iterator[LocalCluster]:
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
-    workers = workers or max(1, min(CPU_COUNT // 2, MEMORY_LIMIT // _MEMORY))
+    workers = workers or max(1, min(CPU_COUNT // 2, MEMORY_LIMIT // _WORKER_MEMORY))
     print(f"workers: {workers}, of at most {MEMORY_LIMIT / workers / 2**30:.1f} GiB each", file=sys.stderr)
     variables = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
     settings = {
@@ -304,7 +304,7 @@ def dask_setup(worker: Any) -> None:
 
     del worker
     warnings.simplefilter("ignore")  # reports have the notes
-    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))  # it may have been imported before the variable was set
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))  # torch may have been imported before it was set
     with contextlib.suppress(ValueError):  # only the main thread can set handlers
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pansplat.inputs.pairs import Pair
 
 _WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
-_HEIGHT = 512  # pixels, of the paper's panoramas
+_HEIGHT = 512  # rows of the paper's panoramas
 
 
 @dataclass(frozen=True)

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
     from pansplat.inputs.pairs import Pair
 
-_INDEX = "index.html"  # of a folder
-_FEW_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # of a panorama in a page
-_MOST_GAUSSIANS = 2_000_000  # of a page in one file
-_BYTES = 22  # of a Gaussian in a page
-_MIN_POINT_OPACITY, _MOST_POINTS = 0.1, 200_000  # of the points to train from
+_INDEX_NAME = "index.html"  # name of the page in a folder
+_MIN_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # for each panorama: least without a note; suggested
+_MAX_GAUSSIANS = 2_000_000  # most Gaussians that the note suggests for a page in one file
+_GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
+_MIN_POINT_OPACITY, _MAX_POINTS = 0.1, 200_000  # points of a training set: least opacity, and their number
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,8 @@ class Page:
     """Then show the page to headsets and phones in the local network, by https, until Ctrl+C."""
     title: str | None = None
     """Title of the page; by default the name of the scene."""
+    address: str | None = None
+    """Address that a folder will have on the web (https://...), for the picture in previews of links to it."""
 
     def write(self, export: Export) -> None:
         """Write the page, print its size, and serve it."""
@@ -105,10 +107,13 @@ class Page:
         from pansplat.export.page_server import serve_page
 
         out, split = export.out, not export.out.suffix
+        if self.address is not None and not (split and self.address.startswith(("http://", "https://"))):
+            wrong = f"{self.address!r} for {out}"
+            raise InputError(f"--address: needed https://... and a folder, got {wrong}; give a whole address and NAME/")
         if split:
             require_output_folder("--out", out)
-            require_replaceable("--out", [out / _INDEX], export.overwrite)
-            out = out / _INDEX
+            require_replaceable("--out", [out / _INDEX_NAME], export.overwrite)
+            out = out / _INDEX_NAME
         shows_all = not export.crop  # photographs would show what a crop leaves out
         has_photographs = shows_all and self.photo_height != 0 and not is_scene_file(export.path)
         count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)
@@ -122,6 +127,7 @@ class Page:
                 gaussians=count,
                 split=split,
                 title=self.title or _name_page(export.path, photographs),
+                address=self.address,
                 photographs=photographs if shows_all else (),
                 photo_height=self.photo_height,
             )
@@ -147,9 +153,9 @@ class Page:
         if photographs and not shows_all:
             print(f"note: {out}: without photographs, which would show what is left out", file=sys.stderr)
         panoramas = max(len(scene.cam2world), 1)
-        if self.gaussians is None and count // panoramas < _FEW_GAUSSIANS:
-            more = min(_GOOD_GAUSSIANS * panoramas, _MOST_GAUSSIANS)
-            size = (page.num_bytes + _BYTES * (more - page.num_gaussians)) / 1e6
+        if self.gaussians is None and count // panoramas < _MIN_GAUSSIANS:
+            more = min(_GOOD_GAUSSIANS * panoramas, _MAX_GAUSSIANS)
+            size = (page.num_bytes + _GAUSSIAN_BYTES * (more - page.num_gaussians)) / 1e6
             print(
                 f"note: {out}: {count // panoramas:,} Gaussians for each of {describe_count(panoramas, 'panorama')}; "
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
@@ -205,8 +211,8 @@ class _TrainingSet:
             scene, source = export.prediction.open_panoramas(export.path, joint=not export.layers)
         gaussians = prune(scene.gaussians, degree=0, min_opacity=_MIN_POINT_OPACITY)
         gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
-        if len(gaussians) > _MOST_POINTS:
-            chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MOST_POINTS]
+        if len(gaussians) > _MAX_POINTS:
+            chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]
             gaussians = gaussians.select(chosen.sort().values)
         panoramas = source.context if isinstance(source, Pair) else source.panoramas
         views = [
@@ -321,7 +327,7 @@ class Export(Computation):
                 scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
             edited = self._edit(scene)
             known, views = scene.cam2world.tolist(), range(len(scene.cam2world))
-            if len(edited.cam2world) < len(known):  # a crop leaves others out
+            if len(edited.cam2world) < len(known):  # a crop leaves views out
                 views = [known.index(pose) for pose in edited.cam2world.tolist()]
             return edited, list_photographs(source, views)
         scene = pipeline.load(self.path)

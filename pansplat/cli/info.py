@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _BARS, _ASCII_BARS = " ▁▂▃▄▅▆▇█", " .:-=+*#@"
 
 
-_MAX_COLUMNS = 64  # of views in the table
+_MAX_COLUMNS = 64  # views that the table shows
 
 
 @dataclass(frozen=True)

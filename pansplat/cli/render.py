@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pansplat.tours.route import Route
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
-_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # pixels
+_VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # rows of a video: perspective, and panoramic
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class Render(Computation):
 
         @functools.lru_cache(maxsize=2)
         def renderer(shown: Scene) -> Callable[..., Rendering]:
-            work = 0 if self.stereo else count  # a card has no kernels of stereo
+            work = 0 if self.stereo else count  # stereo has no kernels for a card
             return pipeline.make_renderer(shown, "film", work, near=near, **options)
 
         @torch.no_grad()

@@ -42,8 +42,8 @@ _DEVIATION = (0.458, 0.448, 0.450)
 # VGG has the largest activations: more than _MAX_WHOLE_PIXELS are processed in bands of _BAND_PIXELS.
 _MAX_WHOLE_PIXELS, _BAND_PIXELS = 1 << 19, 1 << 18
 
-_VGG = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)  # outputs; 0 is a pooling
-# inputs, squeezed, expanded by each of two; 0 is a pooling
+_VGG = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)  # channels; 0 is a pooling
+# Fire modules: inputs, squeezed channels, expanded channels by each of two convolutions; 0 is a pooling.
 _SQUEEZE = ((64, 16, 64), (128, 16, 64), 0, (128, 32, 128), (256, 32, 128), 0, (256, 48, 192), (384, 48, 192))
 
 # Layers whose activations are compared, with their number of channels.
@@ -203,7 +203,7 @@ def banded_distances(
     needs_gradient = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
     for block, head in zip(_split_blocks(layers), heads, strict=True):
         height, width = a.shape[-2:]
-        rows = max(2, pixels // width // 2 * 2)  # even, so that bands do not split a pooling window
+        rows = max(2, pixels // width // 2 * 2)  # an even number, so that bands do not split a pooling window
         parts = []
         for first in range(0, height, rows):
             given = (block, a, b, head, first, min(first + rows, height))

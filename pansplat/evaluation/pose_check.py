@@ -24,10 +24,10 @@ from pansplat.inputs.views import Views
 
 AS_GIVEN = "as given"
 
-_HEIGHT = 64  # pixels
-_CANDIDATES = 32  # inverse depths
-_AGGREGATION = 2  # half size of the window over which differences are averaged, pixels
-_DIFFERENCE_CAP = 0.6  # of a feature; limits the effect of occlusions
+_HEIGHT = 64  # rows of the images that are compared
+_CANDIDATES = 32  # inverse depths that are compared
+_WINDOW_RADIUS = 2  # pixels; half size of the window over which differences are averaged
+_DIFFERENCE_CAP = 0.6  # largest difference of a feature; it limits the effect of occlusions
 # Another interpretation is reported if its error is below this ratio of the error as given, below this error, and
 # smaller by this difference (a ratio of nearly perfect fits is not significant).
 _MAX_RATIO, _MAX_ERROR, _MIN_DIFFERENCE = 0.92, 0.46, 0.02
@@ -35,8 +35,8 @@ _MAX_RATIO, _MAX_ERROR, _MIN_DIFFERENCE = 0.92, 0.46, 0.02
 # error is below this ratio of the median. With it 4 instead of 14 of 106 right poses (zind and villa_8, on which it was
 # chosen) seem a mistake, and 5 instead of 8 of 91 of four other homes.
 _DISTINCT_RATIO = 0.9
-_NO_OVERLAP = 0.5  # a larger error is a fit only if it is distinct
-_SIMILAR_RATIO = 1.03  # to the error as given, up to which an interpretation fits about as well
+_NO_OVERLAP = 0.5  # an interpretation with a larger error fits only if it is distinct
+_SIMILAR_RATIO = 1.03  # ratio to the error as given, up to which an interpretation fits about as well
 _SAME_POSE = 0.02  # largest difference of equal relative poses (translation relative to its length)
 
 _ADVICE = {
@@ -272,8 +272,8 @@ def _sweep_error(
     difference = (warped[:, :-1] - reference).abs().clamp_max(_DIFFERENCE_CAP).mean(dim=1)
     visible = (warped[:, -1] > 0.5) & mask
     difference = torch.where(visible, difference, torch.full_like(difference, _DIFFERENCE_CAP / 2))
-    window = 2 * _AGGREGATION + 1
-    padded = pad_equirect(difference, _AGGREGATION)[:, None]
+    window = 2 * _WINDOW_RADIUS + 1
+    padded = pad_equirect(difference, _WINDOW_RADIUS)[:, None]
     lowest = torch.nn.functional.avg_pool2d(padded, window, stride=1)[:, 0].amin(dim=0)
     weights = row_weights(height, dtype=lowest.dtype)[:, None] * mask
     return float((lowest * weights).sum() / weights.sum().clamp_min(1e-9)) / (_DIFFERENCE_CAP / 2)

@@ -19,7 +19,7 @@ from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urljoin
 
 import msgspec
 import numpy as np
@@ -42,7 +42,7 @@ from pansplat.export.page_data import (
     count_bytes,
     pack_gaussians,
 )
-from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
+from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_files, pack_photographs
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, path_poses, turn_pose
@@ -54,14 +54,15 @@ from pansplat.rendering.image_planes import image_planes
 from pansplat.shaders import load_shader
 from pansplat.system.atomic import replacing
 from pansplat.system.console import with_progress_bar
-from pansplat.system.files import is_written
+from pansplat.system.descriptions import describe_count, list_first
+from pansplat.system.files import SOFTWARE, is_written
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, link_parts
-from pansplat.tours.outlook import find_turned
+from pansplat.tours.outlook import find_widest
 from pansplat.tours.route import find_angles
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
@@ -120,6 +121,7 @@ def write_page(
     gaussians: int = DEFAULT_GAUSSIANS,
     split: bool = False,
     title: str | None = None,
+    address: str | None = None,
     photographs: Sequence[Pair] = (),
     photo_height: int | None = None,
 ) -> PageFiles:
@@ -133,6 +135,7 @@ def write_page(
         gaussians: largest number of Gaussians; similar neighbours are merged.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
+        address: of the page on the web, for previews of links to it. They show the poster of a split page.
         photographs: of each view, which the page shows there (`list_photographs`), with the notes of its
             tour; none without them.
         photo_height: their largest height, pixels, 0 for none; by default what fits, if it is split that of the files.
@@ -201,7 +204,8 @@ def write_page(
         moves = [(turn, *_round(place - origin)) for turn, place in nodes.values()]
         corners = (corners - [*origin, 0, 0]).round(5).tolist()
         header["doll"].append({"nodes": [*nodes], "moves": moves, "corners": corners})
-    files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title or path.stem)
+    title = title or path.stem
+    files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title, address)
     inside = sum(len(each["nodes"]) for each in header["doll"])
     return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
 
@@ -268,7 +272,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
     """Yaw and pitch of the start view of a panorama, else of its widest view."""
     start = tour.find_start_view(view)
-    return find_turned(facts.outlooks[view], None if start is None else find_angles(facts.level.T @ start))[1]
+    return (find_widest(facts.outlooks[view]), 0.0) if start is None else find_angles(facts.level.T @ start)
 
 
 def _order_views(scene: Scene, flights: _Flights) -> list[int]:
@@ -391,7 +395,7 @@ def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence
         image = FilmPhotographs(photographs, scene.cam2world).mix([(pose.numpy(), 1.0, draw)], plane, 0.0)
     pixels = (image * 255).round().clip(0, 255).astype(np.uint8)
     with io.BytesIO() as file:
-        Image.fromarray(pixels).save(file, "JPEG", quality=80, optimize=True)
+        Image.fromarray(pixels).save(file, "JPEG", quality=80, optimize=True, comment=SOFTWARE.encode())
         return file.getvalue()
 
 
@@ -550,6 +554,7 @@ def _write_files(
     atlas: bytes,
     split: bool,
     title: str,
+    address: str | None,
 ) -> PageFiles:
     """Write the page, and its parts if it is split.
 
@@ -557,13 +562,14 @@ def _write_files(
         contents: of the Gaussians of each view.
         atlas: of the doll's house.
     """
-    count = header["count"]
+    count, names = header["count"], [spot["name"] for spot in header["spots"]]
+    labels = label_files(names)
     parts: dict[str, bytes] = {}
     tags: dict[int, list[str]] = {}  # by view
     for view, content in enumerate(contents):
         ends = [len(content)] if split else [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
         chunks = [content[start:end] for start, end in pairwise((0, *ends))]
-        named = {f"{hashlib.blake2b(chunk, digest_size=8).hexdigest()}.bin": chunk for chunk in chunks}
+        named = {_name_part(labels[view], chunk, "bin"): chunk for chunk in chunks}
         header["views"][view]["files"] = [*named]
         parts |= named
         calls = [f"addPart({view}, {'true' if chunk is chunks[-1] else 'false'})" for chunk in chunks]
@@ -574,7 +580,12 @@ def _write_files(
     folder = path.with_name(f"{path.stem}_files")
     folder_address = quote(os.fsencode(folder.name)) if split else None
     elements: list[str] = []
+    texts = {"og:title": title, "og:description": f"{describe_count(len(names), 'panorama')}: {list_first(names)}"}
     if split:
+        preview = _name_part("preview", poster, "jpg")
+        parts[preview] = poster
+        base = address if not address or address.endswith((".html", "/")) else f"{address}/"
+        texts["og:image"] = urljoin(base or "", f"{folder_address}/{preview}")
         for picture in pictures:
             parts |= picture.make_files()
     else:
@@ -592,6 +603,8 @@ def _write_files(
     page = _fill_template(
         connections="'self'" if split else "'none'",
         title=html.escape(title),
+        description=html.escape(texts["og:description"]),
+        properties="\n".join(f'<meta property="{name}" content="{html.escape(text)}">' for name, text in texts.items()),
         style=_read("page.css"),
         poster=base64.b64encode(poster).decode(),
         header=_to_script(msgspec.to_builtins(msgspec.convert(header | {"folder": folder_address}, PageHeader))),
@@ -619,10 +632,13 @@ def _write_files(
     files.insert(0, path)
     total = len(page) + sum(map(len, parts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
-    names = [spot["name"] for spot in header["spots"]]
     fades = tuple((names[a], names[b]) for a, b in header["poor"])
     num_flights = sum(a != b for a, b, _ in header["edges"]) - len(fades)
     return PageFiles(tuple(files), total, count, photo_height, num_flights, fades)
+
+
+def _name_part(label: str, content: bytes, suffix: str) -> str:
+    return f"{label}_{hashlib.blake2b(content, digest_size=8).hexdigest()}.{suffix}"
 
 
 def _make_folder(folder: Path) -> None:
@@ -638,7 +654,7 @@ def _make_folder(folder: Path) -> None:
 def _remove_old_parts(folder: Path) -> None:
     """Remove the parts that no page beside the folder needs, by their names and content, and the folder if that empties
     it. A page of another export that is being written has a temporary name there (`replacing`)."""
-    name = re.compile(r"([0-9a-f]{16})(_\d+)?\.(js|bin|jpg)")
+    name = re.compile(r"(?:\w[\w-]*_)?([0-9a-f]{16})(_\d+)?\.(js|bin|jpg)")
     found = [(file, part[1]) for file in folder.glob("*") if (part := name.fullmatch(file.name)) and is_written(file)]
     needed, address = set(), f'"folder": {_to_script(quote(os.fsencode(folder.name)))}'.encode()
     for page in folder.parent.glob("*.htm*") if found else ():

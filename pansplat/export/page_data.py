@@ -21,7 +21,7 @@ from pansplat import constants
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.morton import morton_codes
-from pansplat.geometry.pose import AHEAD
+from pansplat.geometry.pose import AHEAD_EXPONENT
 from pansplat.system.files import SOFTWARE
 from pansplat.tours import route
 from pansplat.tours.graph import CLEARANCE, POOR_REACH
@@ -140,7 +140,7 @@ class PageConstants(_Record, kw_only=True):
     """Numbers that the page shares with the window and films; the modules that own them say what they are. Angles are
     in radians, fields of view in degrees."""
 
-    ahead: float = AHEAD
+    ahead: float = AHEAD_EXPONENT
     batch: int = BATCH
     near: float = constants.NEAR
     filter_variance: float = constants.FILTER_VARIANCE

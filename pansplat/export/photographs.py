@@ -12,6 +12,8 @@ import dataclasses
 import hashlib
 import io
 import math
+import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,16 +29,18 @@ from torch.nn import functional
 from pansplat import pipeline
 from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
+from pansplat.images.image_files import read_face_size
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.pairs import Pair
-from pansplat.system.files import SOFTWARE
+from pansplat.system.files import SOFTWARE, make_unique_name
 from pansplat.system.progress import report_progress
 from pansplat.tours.graph import TourGraph, make_graph, select_views
 
 MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
 MAX_HEIGHT = 4096  # of a photograph in a folder
-_FACE = 0.65  # size of a face, of the photograph's height; its centre is as dense
+_FACE = 2 / math.pi  # largest size of a face, of the photograph's height: its centre is as dense
 _STEP = 16  # divides the size of a face, pixels
+_LABEL = 40  # letters of the name of a panorama in names of files
 _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
 _TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
 # Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
@@ -51,12 +55,14 @@ class PackedPhotograph:
     """A photograph as files of JPEG.
 
     Attributes:
+        label: begins the names of the files.
         height: of the panorama that it was made from, pixels.
         levels: size of a face and of a tile of each level, the smallest first, pixels.
         tiles: of each level and face, row by row.
         rotation: from the axes of the panorama to the world.
     """
 
+    label: str
     height: int
     levels: tuple[tuple[int, int], ...]
     tiles: tuple[bytes, ...]
@@ -64,8 +70,8 @@ class PackedPhotograph:
 
     @property
     def name(self) -> str:
-        """Hexadecimal digits that change with the content."""
-        return hashlib.blake2b(b"".join(self.tiles), digest_size=8).hexdigest()
+        """The label, and hexadecimal digits that change with the content."""
+        return f"{self.label}_{hashlib.blake2b(b''.join(self.tiles), digest_size=8).hexdigest()}"
 
     @property
     def num_bytes(self) -> int:
@@ -92,6 +98,16 @@ class PackedPhotograph:
         return {f"{self.name}_{n}.jpg": tile for n, tile in enumerate(self.tiles)}
 
 
+def label_files(names: Sequence[str]) -> list[str]:
+    """The names of panoramas as parts of names of files and of addresses; different ones."""
+    labels: list[str] = []
+    for name in names:
+        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
+        label = re.sub("[^a-z0-9]+", "-", plain)[:_LABEL].strip("-")
+        labels.append(make_unique_name(label or "panorama", labels))
+    return labels
+
+
 def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pair]:
     """A pair of one panorama for each of some views of a scene that was predicted from a pair or tour."""
     if isinstance(source, TourGraph):
@@ -111,6 +127,8 @@ def pack_photographs(
         height: largest height, pixels, whatever their size; by default what fits.
     """
     rows = min(height or MAX_HEIGHT, max(photograph.image_height for photograph in photographs))
+    sizes = [read_face_size(photograph.context[0].image) for photograph in photographs]
+    labels = label_files(scene.names)
     qualities = [_QUALITY, *_LOWER_QUALITIES] if num_bytes < math.inf else [_FOLDER_QUALITY]
     while True:
         packed: list[PackedPhotograph] = []
@@ -118,7 +136,9 @@ def pack_photographs(
         for view, photograph in enumerate(photographs):
             report_progress("packing photographs", view / len(photographs))
             image = read_photograph(scene, view, photograph, rows)
-            packed.append(_pack(image, scene.cam2world[view, :3, :3].double().numpy(), qualities[0]))
+            size = min(_FACE * image.shape[1], sizes[view])
+            rotation = scene.cam2world[view, :3, :3].double().numpy()
+            packed.append(_pack(image, size, labels[view], rotation, qualities[0]))
             expected = sum(each.num_bytes for each in packed) * len(photographs) / len(packed)
             limit = (1.5 if len(packed) < len(photographs) else 1) * num_bytes
             if expected > limit and (can_shrink or (height is None and len(qualities) > 1)):
@@ -126,7 +146,8 @@ def pack_photographs(
         else:
             return packed
         if can_shrink:  # bytes grow by less than the number of pixels
-            rows = max(round(rows * min(math.sqrt(num_bytes / expected), _SHRINK)), MIN_HEIGHT)
+            shown = min(rows, round(max(sizes) / _FACE))
+            rows = max(round(shown * min(math.sqrt(num_bytes / expected), _SHRINK)), MIN_HEIGHT)
         else:
             qualities.pop(0)
 
@@ -174,10 +195,11 @@ def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarra
     return ((distances - _GUARD) / feather).clip(0, 1).astype(np.float32)
 
 
-def _pack(image: Float[Tensor, "3 height width"], rotation: np.ndarray, quality: int) -> PackedPhotograph:
-    """The tiles of all levels."""
-    height = image.shape[1]
-    size = max(round(_FACE * height / _STEP) * _STEP, _STEP)
+def _pack(
+    image: Float[Tensor, "3 height width"], most: float, label: str, rotation: np.ndarray, quality: int
+) -> PackedPhotograph:
+    """The tiles of all levels; the largest one has faces of at most a size."""
+    size = max(int(most / _STEP) * _STEP, _STEP)
     sizes = [smaller for smaller in (_PREVIEW, _MIDDLE) if 1.3 * smaller < size]
     levels = tuple((each, -(-each // -(-each // _TILE))) for each in (*sizes, size))
     tiles: list[list[bytes]] = [[] for _ in levels]
@@ -187,7 +209,7 @@ def _pack(image: Float[Tensor, "3 height width"], rotation: np.ndarray, quality:
             reduced = cv2.resize(pixels, (smaller, smaller), interpolation=cv2.INTER_AREA)
             is_preview = level == 0 < len(levels) - 1
             tiles[level] += _encode(reduced, tile, _PREVIEW_QUALITY if is_preview else quality)
-    return PackedPhotograph(height, levels, tuple(each for level in tiles for each in level), rotation)
+    return PackedPhotograph(label, image.shape[1], levels, tuple(each for level in tiles for each in level), rotation)
 
 
 def _encode(pixels: UInt8[np.ndarray, "size size 3"], tile: int, quality: int) -> list[bytes]:

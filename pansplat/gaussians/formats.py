@@ -43,9 +43,9 @@ from pansplat.system.atomic import replacing
 from pansplat.system.files import find_scene_suffix, read_file, require_file
 
 _MAX_FILE = 1 << 32  # bytes
-_MAX_ENTRY = 1 << 26  # bytes of the pansplat entry
-_EXPANSION, _FREE_BYTES = 256, 1 << 26  # bytes of decoded Gaussians for a byte of their file, and for any file
-_DECODED_BYTES = 236  # of a Gaussian with harmonics of degree 3
+_MAX_ENTRY_BYTES = 1 << 26  # bytes of the largest pansplat entry
+_EXPANSION, _FREE_BYTES = 256, 1 << 26  # limit of the decoded bytes: for each byte of the file, and in addition
+_DECODED_BYTES = 236  # bytes of a decoded Gaussian with harmonics of degree 3
 _DECODE_SECONDS = 600  # a damaged file may not end
 _CODER = """
 import os, sys
@@ -254,7 +254,7 @@ def _find_ply_comment(content: bytes) -> str | None:
     return find_entry([line.removeprefix("comment ").strip() for line in lines if line.startswith("comment ")])
 
 
-_GZIP_HEADER, _GZIP_COMMENT = 10, 0x10  # bytes without fields, flag of the comment
+_GZIP_HEADER, _GZIP_COMMENT = 10, 0x10  # bytes of a header without fields; its flag that a comment follows
 
 
 def _insert_gzip_comment(content: bytes, entry: str) -> bytes:
@@ -267,7 +267,7 @@ def _insert_gzip_comment(content: bytes, entry: str) -> bytes:
 def _find_gzip_comment(content: bytes) -> str | None:
     if content[:2] != b"\x1f\x8b" or content[3:4] != bytes([_GZIP_COMMENT]):
         return None
-    end = content.find(b"\0", _GZIP_HEADER, _GZIP_HEADER + _MAX_ENTRY)
+    end = content.find(b"\0", _GZIP_HEADER, _GZIP_HEADER + _MAX_ENTRY_BYTES)
     return find_entry([content[_GZIP_HEADER : max(end, _GZIP_HEADER)].decode("latin-1")])
 
 
@@ -291,7 +291,7 @@ def _insert_zip_entry(content: bytes, entry: str) -> bytes:
 def _find_zip_entry(content: bytes) -> str | None:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive, archive.open(_ZIP_ENTRY) as file:
-            return file.read(_MAX_ENTRY).decode(errors="replace")
+            return file.read(_MAX_ENTRY_BYTES).decode(errors="replace")
     except Exception:  # the standard library raises many types for a damaged archive
         return None
 

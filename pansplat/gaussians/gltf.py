@@ -43,10 +43,10 @@ from pansplat.system.strict_json import convert, parse_json, read_field
 _Object = dict[str, Any]
 _Vector = tuple[float, float, float]
 _EXTENSION = "KHR_gaussian_splatting"
-_MAX_BYTES = (1 << 32) - 1  # lengths are 32 bits
-_MAX_DEGREE = 3  # of harmonics in the extension for Gaussians
-_MAX_JSON = 1 << 26  # bytes
-_MAX_NODES = 1 << 14  # of a file, against cycles
+_MAX_BYTES = (1 << 32) - 1  # bytes; a file states its lengths in 32 bits
+_MAX_DEGREE = 3  # highest degree of the harmonics in KHR_gaussian_splatting
+_MAX_JSON = 1 << 26  # bytes of the largest JSON part
+_MAX_NODES = 1 << 14  # nodes of a scene, at most, so that a cycle of nodes ends
 _MAGIC, _VERSION, _JSON, _BINARY = b"glTF", 2, 0x4E4F534A, 0x004E4942
 _POINTS, _ARRAY_BUFFER = 0, 34962
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-MAX_DEGREE = 4  # docs/official.md: 25 harmonics a channel
-SH_0 = 0.28209479177387814  # the harmonic of degree 0
-_OFFICIAL_DEGREE = 3  # that its rasteriser evaluates
+MAX_DEGREE = 4  # 25 harmonics a channel, as the official model (docs/official.md)
+SH_0 = 0.28209479177387814  # value of the harmonic of degree 0, which is constant
+_OFFICIAL_DEGREE = 3  # the degree that the official rasteriser evaluates
 # The official x, y, z axes of the harmonics in world axes: z, x, y.
 _OFFICIAL_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
@@ -113,7 +113,7 @@ def rotate_harmonics(
     """Coefficients of the same colours after a rotation of the world."""
     degree = math.isqrt(harmonics.shape[-2]) - 1
     matrix = rotation_matrices(rotation.double(), degree).to(harmonics)
-    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)  # a single matrix product
+    return (harmonics.transpose(-1, -2) @ matrix.T).transpose(-1, -2)
 
 
 @functools.lru_cache

@@ -44,11 +44,11 @@ from pansplat.system.files import SOFTWARE, require_file
 OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
 
-COMMENT_PREFIX = "pansplat "  # of the header comment with the pansplat entry
-_MAX_HEADER = 1 << 24  # bytes
-_RUNS_SPACE = 4096  # bytes for about 300 runs; some browser viewers need the header within 10,000 bytes
+COMMENT_PREFIX = "pansplat "  # start of the header's comment that holds the pansplat entry
+_MAX_HEADER = 1 << 24  # bytes of the longest header that is read
+_RUNS_SPACE = 4096  # bytes of a header for about 300 runs; some browser viewers need the header within 10,000 bytes
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
-_MAX_PROPERTIES = 1 << 10  # of an element
+_MAX_PROPERTIES = 1 << 10  # properties that an element may have
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -256,7 +256,7 @@ def _build_vertex_table(gaussians: Gaussians) -> np.ndarray:
 @dataclass(frozen=True)
 class _Header:
     order: str
-    skipped_bytes: int  # of the elements before the vertices
+    skipped_bytes: int  # bytes of the elements before the vertices
     count: int
     dtype: np.dtype
     comments: list[str]

@@ -100,7 +100,7 @@ class Gaussians:
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians of a boolean mask or of indices, in their order."""
         if index.dtype == torch.bool:
-            index = index.nonzero()[:, 0]  # once for all fields
+            index = index.nonzero()[:, 0]
         return Gaussians(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
 
     def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Gaussians:

@@ -23,10 +23,10 @@ from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.world import MAX_POSITION, WorldFrame, choose_unit, require_depth_range
 from pansplat.system.strict_json import convert, parse_json
 
-Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # from y down to y up, and back
+Y_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # turns y down to y up, and back
 
-_MAX_RUNS = 4096  # the Gaussians are sorted if the entry would list more runs, which take megabytes
-_MAX_CAMERAS = 1 << 12  # of a scene
+_MAX_RUNS = 4096  # runs in the entry, which take megabytes; Gaussians with more runs are sorted
+_MAX_CAMERAS = 1 << 12  # cameras that a scene may have
 _Camera = Annotated[int, Meta(ge=0)]
 _Level = Annotated[int, Meta(ge=0, le=255)]
 _Position = Annotated[float, Meta(ge=-MAX_POSITION, le=MAX_POSITION)]

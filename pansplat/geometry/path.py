@@ -14,7 +14,7 @@ from torch import Tensor
 from pansplat.geometry.pose import interpolate_poses
 
 _MIN_STEP = 1e-6  # metres; a shorter step has no direction
-_EXCURSION = 0.4  # metres, of a flight with a single camera
+_EXCURSION_DIAMETER = 0.4  # metres; a single camera flies on a circle of this diameter
 
 
 def ease_in_out(fraction: float) -> float:
@@ -149,7 +149,7 @@ def fly_pose(
     if len(cam2world) == 1:
         angle = 2 * math.pi * eased
         pose = pose.clone()
-        pose[:3, 3] += 0.5 * _EXCURSION * ((1 - math.cos(angle)) * pose[:3, 2] - math.sin(angle) * pose[:3, 0])
+        pose[:3, 3] += 0.5 * _EXCURSION_DIAMETER * ((1 - math.cos(angle)) * pose[:3, 2] - math.sin(angle) * pose[:3, 0])
     # The turn depends on the eased fraction, so that it also starts and stops smoothly.
     return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
 

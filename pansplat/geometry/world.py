@@ -16,14 +16,14 @@ from torch import Tensor
 
 from pansplat.errors import InputError
 
-MIN_DEPTH, MAX_DEPTH = 1e-9, 1e9  # in the unit of the poses
-MAX_POSITION = 1e12  # of a camera
-MIN_RATIO = 1.001  # of the largest to the smallest depth
+MIN_DEPTH, MAX_DEPTH = 1e-9, 1e9  # limits of depths, in the unit of the poses
+MAX_POSITION = 1e12  # largest coordinate of a camera, in the unit of the poses
+MIN_RATIO = 1.001  # least ratio of the largest to the smallest depth
 
-_METRES = (1 / 64, 64.0)  # smallest depths of worlds whose unit is kept
-_MAX_LOCAL = 1e5  # metres from the origin, at which float32 has steps of a centimetre
-_KEPT = 256.0  # metres from the origin, within which the middle of the cameras may be
-_CELL = 64.0  # metres; other origins are multiples, so that they seldom change when a camera is added
+_NEAR_RANGE = (1 / 64, 64.0)  # metres; worlds whose smallest depth is in this range keep their unit
+_MAX_LOCAL = 1e5  # metres of a camera from the origin; farther out, float32 has steps of a centimetre
+_MAX_CENTER = 256.0  # metres; worlds whose cameras have their middle within this of the origin keep it
+_ORIGIN_CELL = 64.0  # metres; new origins are multiples of it, so that they seldom change when a camera is added
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,16 @@ def choose_frame(cam2world: Float[Tensor, "*batch 4 4"], near: float) -> WorldFr
     """
     unit = choose_unit(near)
     center = cam2world[..., :3, 3].double().reshape(-1, 3).mean(dim=0).cpu()
-    if float(center.abs().max()) <= _KEPT * unit:
+    if float(center.abs().max()) <= _MAX_CENTER * unit:
         return WorldFrame(unit)
-    x, y, z = (torch.round(center / (_CELL * unit)) * _CELL * unit).tolist()
+    x, y, z = (torch.round(center / (_ORIGIN_CELL * unit)) * _ORIGIN_CELL * unit).tolist()
     return WorldFrame(unit, (x, y, z))
 
 
 def choose_unit(near: float) -> float:
     """The unit of a working world, see `WorldFrame`: that of micrometres, millimetres, metres, kilometres and so on in
     which the smallest depth is nearest to 1; 1 for most worlds."""
-    return 1.0 if _METRES[0] <= near <= _METRES[1] else 1000.0 ** round(math.log(near, 1000))
+    return 1.0 if _NEAR_RANGE[0] <= near <= _NEAR_RANGE[1] else 1000.0 ** round(math.log(near, 1000))
 
 
 def require_working_world(cam2world: Float[Tensor, "*batch 4 4"], near: float, far: float) -> None:
@@ -92,7 +92,7 @@ def require_working_world(cam2world: Float[Tensor, "*batch 4 4"], near: float, f
     farthest = float(cam2world[..., :3, 3].abs().max())
     if choose_unit(near) != 1 or farthest > _MAX_LOCAL:
         raise InputError(
-            f"`near` and `cam2world`: needed depths from {_METRES[0]:g} to {_METRES[1]:g} m and cameras within "
+            f"`near` and `cam2world`: needed depths from {_NEAR_RANGE[0]:g} to {_NEAR_RANGE[1]:g} m and cameras within "
             f"{_MAX_LOCAL:g} m of the origin, got near={near:g} and a camera at {farthest:g}; bring them to a world of "
             "metres (pansplat.geometry.world.choose_frame)."
         )

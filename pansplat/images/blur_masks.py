@@ -30,13 +30,13 @@ from pansplat.images.cube_images import BESIDE, CUBE_SUFFIX
 from pansplat.images.rig_images import RIG_SUFFIX
 from pansplat.system.strict_json import read_json
 
-BLUR_SUFFIX, MASK_SUFFIX = "_blur", "_mask"  # of the stem of a mask
+BLUR_SUFFIX, MASK_SUFFIX = "_blur", "_mask"  # ends of the stem of a mask's file name
 
 _MASK_NAME = re.compile(r"(?:(.*)_)?(blur|mask)(?:\.\w+)*", re.IGNORECASE | re.DOTALL)
 _listed: ContextVar[dict[tuple[Path, str], dict[str, list[Path]]] | None] = ContextVar("listed", default=None)
-_ROWS = 256  # at most, in which the surroundings are blurred
-_MARGIN = 1 / 128  # of the height; a JPEG mixes pixels within blocks of 16
-_LEAST_SHARE = 0.25  # of a cell that is not hidden, for a colour of its own
+_MAX_ROWS = 256  # rows of the reduced picture in which the surroundings are blurred
+_MARGIN_SHARE = 1 / 128  # growth of hidden regions, relative to the height; a JPEG mixes pixels within blocks of 16
+_MIN_VISIBLE_SHARE = 0.25  # a cell of which less is visible takes its colour from its surroundings
 
 
 def split_mask_name(path: Path) -> tuple[str, str] | None:
@@ -113,7 +113,7 @@ def resize_hidden(
 
 def widen_hidden(hidden: Bool[NDArray[Any], "height width"]) -> Bool[NDArray[Any], "height width"]:
     """What is hidden and a margin of 1.4 degrees around it: a photograph shows traces of a thing beside it."""
-    margin = max(round(_MARGIN * hidden.shape[0]), 1)
+    margin = max(round(_MARGIN_SHARE * hidden.shape[0]), 1)
     padded = np.pad(hidden.astype(np.uint8), ((0, 0), (margin, margin)), mode="wrap")
     return cv2.dilate(padded, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8))[:, margin:-margin] > 0
 
@@ -133,7 +133,7 @@ def blur_hidden(color: NDArray[Any], hidden: Bool[NDArray[Any], "height width"])
     result = color.copy()
     result[hidden] = 0
     height, width = hidden.shape
-    rows = 1 << min(_ROWS.bit_length() - 1, height.bit_length() - 1)  # at most the height, a power of two
+    rows = 1 << min(_MAX_ROWS.bit_length() - 1, height.bit_length() - 1)  # a power of two
     size = (2 * rows, rows)
     mean = cv2.resize(result, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     share = cv2.resize((~hidden).astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -159,8 +159,8 @@ def _pull_and_push(
     sums: Float[NDArray[Any], "rows columns 3"], share: Float[NDArray[Any], "rows columns"]
 ) -> Float[NDArray[Any], "rows columns 3"]:
     """Colours of all cells from the sums of those of which a share is known."""
-    is_known = share > _LEAST_SHARE
-    known = np.where(is_known[..., None], sums / np.maximum(share, _LEAST_SHARE)[..., None], 0)
+    is_known = share > _MIN_VISIBLE_SHARE
+    known = np.where(is_known[..., None], sums / np.maximum(share, _MIN_VISIBLE_SHARE)[..., None], 0)
     if is_known.all():
         return known
     rows, columns = share.shape

@@ -44,7 +44,7 @@ def group_faces(images: Sequence[Path]) -> tuple[dict[str, CubeImage], list[Path
         if len(group) < 6 or used & set(group.values()):
             continue
         files = [group[ending] for ending in _ENDINGS[number]]
-        if not any(_is_square(file) for file in files):  # panoramas of these names
+        if not any(_is_square(file) for file in files):  # these are panoramas with such names
             continue
         used |= set(files)
         try:

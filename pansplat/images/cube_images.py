@@ -37,13 +37,13 @@ ROW, COLUMN = "{row}", "{column}"  # in the path of a face: numbers of a tile, f
 
 Decode = Callable[[Path], UInt8[Array, "rows columns 3"]]
 
-LARGEST_DENSITY, DENSITY = 1.5, 1.28  # pixels of a picture for one of a panorama, above which it is reduced, and then
+LARGEST_DENSITY, DENSITY = 1.5, 1.28  # face pixels for one of the panorama: faces with more are reduced to the second
 MAX_SIZE = 8000  # pixels along a face; OpenCV resamples at most 32,767 rows
-_MIN_HEIGHT = 4  # of a panorama in which every face has rows and columns
-_PAD = 2  # pixels of the neighbouring faces, for the cubic filter
-_SAMPLES = 2  # per pixel and axis; faces are up to twice as dense at their edges as a panorama
+_MIN_HEIGHT = 4  # rows of a panorama from which on every face has rows and columns
+_FRAME = 2  # pixels around a face that the cubic filter takes from the neighbouring faces
+_SAMPLES = 2  # samples per pixel and axis; faces are up to twice as dense at their edges as a panorama
 _DENSE_FACE = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
-_CAP = 0.6  # latitude above which a column meets the upper or lower face, radians; at the cube's corners 0.615
+_CAP = 0.6  # radians; beyond it a column may meet the upper or lower face; the cube's corners are at 0.615
 
 
 @dataclass(frozen=True)
@@ -200,8 +200,8 @@ def _sample_columns(
     latitude: Float[Array, "row"],
 ) -> UInt8[Array, "row column 3"]:
     """Samples of columns that cross a side face and the upper and lower faces."""
-    half = np.float32((len(padded[0]) - 2 * _PAD) / 2)
-    shift = half + np.float32(_PAD - 0.5)
+    half = np.float32((len(padded[0]) - 2 * _FRAME) / 2)
+    shift = half + np.float32(_FRAME - 0.5)
 
     def sample(face: int, x: Float[Array, "row column"], y: Float[Array, "row column"]) -> UInt8[Array, "row column 3"]:
         return cv2.remap(padded[face], x + shift, y + shift, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -226,15 +226,15 @@ def _slice(chosen: Bool[Array, "row"]) -> slice:
 
 
 def _pad_faces(faces: list[UInt8[Array, "size size 3"]]) -> list[UInt8[Array, "side side 3"]]:
-    """The faces with a frame of `_PAD` pixels, sampled from the faces around each."""
+    """The faces with a frame of `_FRAME` pixels, sampled from the faces around each."""
     size = len(faces[0])
     rotations = face_rotations().numpy()
     padded = []
-    inside = slice(_PAD, _PAD + size)
-    before, behind, whole = slice(0, _PAD), slice(_PAD + size, None), slice(None)
-    position = (np.arange(-_PAD, size + _PAD) + 0.5) / size * 2 - 1
+    inside = slice(_FRAME, _FRAME + size)
+    before, behind, whole = slice(0, _FRAME), slice(_FRAME + size, None), slice(None)
+    position = (np.arange(-_FRAME, size + _FRAME) + 0.5) / size * 2 - 1
     for face, rotation in zip(faces, rotations, strict=True):
-        result = cv2.copyMakeBorder(face, _PAD, _PAD, _PAD, _PAD, cv2.BORDER_REPLICATE)
+        result = cv2.copyMakeBorder(face, _FRAME, _FRAME, _FRAME, _FRAME, cv2.BORDER_REPLICATE)
         for rows, columns in ((before, inside), (behind, inside), (whole, before), (whole, behind)):
             y, x = np.meshgrid(position[rows], position[columns], indexing="ij")
             rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ rotation.T

@@ -47,14 +47,14 @@ READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff")
 
 _PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_MAX_BYTES = 1 << 31  # of a file
-_MAX_PIXELS = 178_956_970  # of Pillow: twice Image.MAX_IMAGE_PIXELS
+_MAX_BYTES = 1 << 31  # bytes of the largest file that is read
+_MAX_PIXELS = 178_956_970  # Pillow's limit: twice Image.MAX_IMAGE_PIXELS
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _JPEG_MAGIC, _JPEG_END, _PNG_MAGIC = b"\xff\xd8", b"\xff\xd9", b"\x89PNG"
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # panoramas of 100 megapixels are normal
 logging.getLogger("PIL").setLevel(logging.CRITICAL)  # a damaged file is an error of one line
 _TAIL = 4096  # bytes at the end of a file that are read to find the end of a JPEG
-_ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF, and its values for a quarter turn
+_ORIENTATION, _TURNED = 0x0112, (5, 6, 7, 8)  # tag of EXIF; its values for quarter turns
 _ORIENT = {
     2: lambda a: a[:, ::-1], 3: lambda a: a[::-1, ::-1], 4: lambda a: a[::-1], 5: lambda a: a.swapaxes(0, 1),
     6: lambda a: np.rot90(a, -1), 7: lambda a: a[::-1, ::-1].swapaxes(0, 1), 8: lambda a: np.rot90(a),
@@ -63,9 +63,9 @@ _DAMAGED = (  # what Pillow raises for damaged files; InputError is a ValueError
     OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError,
     RuntimeError, struct.error,
 )  # fmt: skip
-_BITS_PER_SAMPLE = 258  # tag of TIFF
-_DARK_CORNER, _LIT_CIRCLE = 30, 60  # grey values, of the corners of a fisheye picture, and of what its circles show
-_WRAP = 16  # margin of the wrap-around at +-180 degrees for the resampling filter, target pixels
+_BITS_PER_SAMPLE = 258  # number of the TIFF tag
+_DARK_CORNER, _LIT_CIRCLE = 30, 60  # grey values: darkest corners and dimmest circles of a fisheye picture
+_WRAP = 16  # pixels of the target: margin of the wrap-around at +-180 degrees for the resampling filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +122,13 @@ def read_panorama(
 def read_height(path: Path | str) -> int:
     """Height of an image file, pixels; of cube faces that of the panorama that they give. No pixels are decoded."""
     return read_size(path)[1]
+
+
+def read_face_size(path: Path | str) -> int:
+    """Size of a cube face that has the detail of an image file, pixels: that of the file's faces, else with as many
+    pixels for an angle in its middle as the panorama, width / pi. No pixels are decoded."""
+    path = Path(path)
+    return read_cube(path).levels[-1].size if path.name.endswith(CUBE_SUFFIX) else int(2 * read_height(path) / math.pi)
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
@@ -243,7 +250,7 @@ def list_masks(path: Path, *, check: bool = False) -> list[Path]:
 
 def _require_fit(mask: Path, size: tuple[int, int], picture: tuple[int, int]) -> None:
     """Check the proportions of a mask by its width and height, and those of its picture."""
-    if abs(size[0] * picture[1] - size[1] * picture[0]) >= max(*size, *picture):  # more than rounding
+    if abs(size[0] * picture[1] - size[1] * picture[0]) >= max(*size, *picture):  # not mere rounding
         raise InputError(
             f"{mask}: needed a mask of the proportions of its picture, {picture[0]}x{picture[1]}, got {size[0]}x"
             f"{size[1]} (width x height); draw it on the whole picture."
@@ -546,7 +553,7 @@ def _open_with_pillow(
             image.load()
         return ImageOps.exif_transpose(image) if orient else image
     except Image.UnidentifiedImageError as error:
-        if data.startswith(_TIFF_MAGIC):  # its directory may be at the end
+        if data.startswith(_TIFF_MAGIC):  # the directory of a TIFF may be at the end
             raise InputError(
                 f"{path}: needed a complete image, got damaged or truncated data; copy or export it again."
             ) from error

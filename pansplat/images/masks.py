@@ -27,28 +27,28 @@ from pansplat.images.image_files import list_masks, read_thumbnail
 Array = NDArray[Any]
 
 _HEIGHT = 256  # pixels; height of the panoramas for detection
-_MAX_IMAGES = 16  # evenly spaced panoramas of a long sequence
-_MIN_DIFFERENCE = 0.02  # mean grey difference below which two panoramas count as taken at one place
+_MAX_IMAGES = 16  # evenly spaced panoramas of a long sequence that are compared
+_MIN_DIFFERENCE = 0.02  # mean grey difference; two panoramas with less count as taken at one place
 
-_STEP = 0.5  # degrees between samples of the polar maps
-_REACH = 50.0  # degrees; radius of the polar maps
-_RINGS, _SECTORS = int(_REACH / _STEP), 180  # of the polar maps
+_SAMPLE_DEGREES = 0.5  # degrees between samples of the polar maps
+_MAP_RADIUS = 50.0  # degrees; radius of the polar maps
+_RINGS, _SECTORS = int(_MAP_RADIUS / _SAMPLE_DEGREES), 180  # samples of the polar maps: from the pole, and around it
 _MIN_RADIUS, _MAX_RADIUS = 4.0, 45.0  # degrees from the pole to the outline
 _MAX_BEND = 2  # largest change of the outline's ring between neighbouring sectors
-_QUANTILE = 0.2  # over the panoramas: four of five must have the edge
+_EDGE_QUANTILE = 0.2  # quantile over the panoramas: four of five must have an edge
 _MIN_EDGE = 0.02  # grey contrast over a degree
-_MIN_COVERAGE = 0.85  # fraction of the outline with that contrast
+_MIN_COVERAGE = 0.85  # least fraction of the outline with that contrast
 _MAX_SHIFT = 5  # samples between views of a static outline, because panoramas are levelled after capture
 _OUTLINE_BAND = 5  # samples on both sides of the outline that are compared
 _SURROUNDINGS = 10, 30  # samples from the outline to the inner and outer edge of the surroundings
-_MIN_CORRELATION = 0.5  # of a static outline between two views
-_MAX_RELATIVE = 0.6  # largest correlation of the surroundings relative to that of the outline
+_MIN_CORRELATION = 0.5  # least correlation of a static outline between two views
+_MAX_AROUND = 0.6  # largest correlation of an outline's surroundings, relative to the outline's
 _MIN_PAIRS = 0.6  # fraction of the pairs of views that must agree; one view with glare spoils two pairs of five
 _MIN_VIEWS_FOR_LEGS = 4  # with fewer panoramas too many edges are static by chance
 _LEG_RADIUS, _LEG_SHIFT, _LEG_GAP = 5, 5, 7  # samples: half thickness, shift between views, largest interruption
 _LEG_CONTRAST = 0.045  # grey difference to the floor
-_MARGIN = 3  # samples added around the region, because its edge is blurred
-_BLACK = 1e-6  # of black surfaces; less than any display shows
+_REGION_MARGIN = 3  # samples added around the region, because its edge is blurred
+_LEAST_COLOR = 1e-6  # value in [0, 1] that black surfaces get, which are no holes then; less than any display shows
 
 
 def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "height width"]:
@@ -90,7 +90,7 @@ def lift_black_surfaces(image: Float[Tensor, "3 height width"]) -> Float[Tensor,
         return image
     _, labels = cv2.connectedComponents(patches)
     surfaces = (patches > 0) & ~np.isin(labels, labels[[0, -1]])
-    return torch.where(torch.from_numpy(surfaces), image.clamp_min(_BLACK), image)
+    return torch.where(torch.from_numpy(surfaces), image.clamp_min(_LEAST_COLOR), image)
 
 
 def _black_patches(image: Float[Tensor, "3 height width"]) -> NDArray[np.uint8]:
@@ -129,7 +129,7 @@ def _cached_mask(stamped: tuple[tuple[Path, Any, Any], ...]) -> NDArray[np.bool_
     for path, *_ in stamped:
         try:
             images.append(read_thumbnail(path, _HEIGHT))
-        except InputError:  # raised again when the panorama is loaded
+        except InputError:  # the error is raised again when the panorama is loaded
             continue
     if len(images) < 2:
         return np.ones((_HEIGHT, 2 * _HEIGHT), dtype=bool)
@@ -158,7 +158,7 @@ def _static_cap(grey: Array) -> NDArray[np.bool_]:
     region = cv2.dilate(inside, _ellipse(1))
     if len(discs) >= _MIN_VIEWS_FOR_LEGS:
         region = _add_legs(discs, region)
-    return _cap_from_disc(cv2.dilate(region, _ellipse(_MARGIN)), grey.shape[1])
+    return _cap_from_disc(cv2.dilate(region, _ellipse(_REGION_MARGIN)), grey.shape[1])
 
 
 def _sample(grey: Array, colatitude: Array, azimuth: Array) -> Array:
@@ -175,7 +175,7 @@ def _sample(grey: Array, colatitude: Array, azimuth: Array) -> Array:
 
 def _ring_edges(grey: Array) -> Array:
     """Outward grey differences over two degrees (view ring sector)."""
-    rings, sectors = (np.arange(_RINGS) + 0.5) * _STEP, (np.arange(_SECTORS) + 0.5) * 360 / _SECTORS
+    rings, sectors = (np.arange(_RINGS) + 0.5) * _SAMPLE_DEGREES, (np.arange(_SECTORS) + 0.5) * 360 / _SECTORS
     azimuth, colatitude = np.meshgrid(sectors, rings)
     kernel = np.array([[-0.5], [-0.5], [0], [0.5], [0.5]], dtype=np.float32)
     maps = [_sample(g, colatitude, azimuth) for g in grey]
@@ -184,7 +184,7 @@ def _ring_edges(grey: Array) -> Array:
 
 def _common_edges(signed: Array) -> Array:
     """Magnitude of the edges that most views (axis 0) have with the same sign, else 0."""
-    low, high = np.quantile(signed, (_QUANTILE, 1 - _QUANTILE), axis=0)
+    low, high = np.quantile(signed, (_EDGE_QUANTILE, 1 - _EDGE_QUANTILE), axis=0)
     return np.maximum(np.maximum(low, 0), np.maximum(-high, 0)).astype(np.float32)
 
 
@@ -194,9 +194,9 @@ def _closed_outline(edges: Array) -> NDArray[np.intp]:
     Two turns are optimised and the middle one is kept, so that the curve closes.
     """
     rings, sectors = edges.shape
-    gain = np.minimum(edges, 3 * _MIN_EDGE)  # so that a few strong edges do not compensate for gaps
-    gain[: int(_MIN_RADIUS / _STEP)] = -1
-    gain[int(_MAX_RADIUS / _STEP) :] = -1
+    gain = np.minimum(edges, 3 * _MIN_EDGE)  # the limit keeps a few strong edges from compensating for gaps
+    gain[: int(_MIN_RADIUS / _SAMPLE_DEGREES)] = -1
+    gain[int(_MAX_RADIUS / _SAMPLE_DEGREES) :] = -1
     score = np.zeros(rings)
     came_from = np.empty((2 * sectors, rings), dtype=np.intp)
     steps = np.arange(-_MAX_BEND, _MAX_BEND + 1)
@@ -217,7 +217,7 @@ def _closed_outline(edges: Array) -> NDArray[np.intp]:
 
 def _disc_coordinates() -> tuple[Array, Array]:
     """Radius and azimuth of the samples of a flat map around the pole, degrees."""
-    axis = ((np.arange(2 * _RINGS) + 0.5) * _STEP - _REACH).astype(np.float32)
+    axis = ((np.arange(2 * _RINGS) + 0.5) * _SAMPLE_DEGREES - _MAP_RADIUS).astype(np.float32)
     x, y = np.meshgrid(axis, axis)
     return np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360
 
@@ -231,7 +231,7 @@ def _inside(outline: NDArray[np.intp]) -> NDArray[Any]:
     """A mask of the disc samples within the outline."""
     radius, azimuth = _disc_coordinates()
     sector = (azimuth / 360 * _SECTORS).astype(int) % _SECTORS
-    return (radius <= (outline[sector] + 0.5) * _STEP).astype(np.uint8)
+    return (radius <= (outline[sector] + 0.5) * _SAMPLE_DEGREES).astype(np.uint8)
 
 
 def _ellipse(samples: int) -> NDArray[Any]:
@@ -249,7 +249,7 @@ def _is_static(discs: Array, inside: NDArray[Any]) -> bool:
 
     False where little moves at all, such as a high ceiling with a short baseline.
     """
-    near = _disc_coordinates()[0] < _REACH
+    near = _disc_coordinates()[0] < _MAP_RADIUS
     outline = (cv2.dilate(inside, _ellipse(_OUTLINE_BAND)) > cv2.erode(inside, _ellipse(_OUTLINE_BAND))) & near
     around = (cv2.dilate(inside, _ellipse(_SURROUNDINGS[1])) > cv2.dilate(inside, _ellipse(_SURROUNDINGS[0]))) & near
     views = range(len(discs))
@@ -258,7 +258,7 @@ def _is_static(discs: Array, inside: NDArray[Any]) -> bool:
     static = []
     for i, j in pairs:
         fit = _best_fit(gradients[i], gradients[j], outline)
-        static.append(fit > _MIN_CORRELATION and _best_fit(gradients[i], gradients[j], around) < _MAX_RELATIVE * fit)
+        static.append(fit > _MIN_CORRELATION and _best_fit(gradients[i], gradients[j], around) < _MAX_AROUND * fit)
     return float(np.mean(static)) >= _MIN_PAIRS
 
 
@@ -282,11 +282,11 @@ def _add_legs(discs: Array, region: NDArray[Any]) -> NDArray[Any]:
     for operation in (cv2.MORPH_BLACKHAT, cv2.MORPH_TOPHAT):
         thin = [cv2.morphologyEx(disc, operation, _ellipse(_LEG_RADIUS)) for disc in discs]
         # Dilated by the largest shift between views, so that shifted parts overlap.
-        common = np.quantile([cv2.dilate(t, _ellipse(_LEG_SHIFT)) for t in thin], _QUANTILE, axis=0)
+        common = np.quantile([cv2.dilate(t, _ellipse(_LEG_SHIFT)) for t in thin], _EDGE_QUANTILE, axis=0)
         parts |= (common > _LEG_CONTRAST).astype(np.uint8)
     joined = cv2.morphologyEx(region | parts, cv2.MORPH_CLOSE, _ellipse(_LEG_GAP))
     _, labels = cv2.connectedComponents(joined, connectivity=8)
-    found = (labels == labels[_RINGS, _RINGS]) & (labels > 0) & (_disc_coordinates()[0] < _REACH)
+    found = (labels == labels[_RINGS, _RINGS]) & (labels > 0) & (_disc_coordinates()[0] < _MAP_RADIUS)
     return found.astype(np.uint8) | region
 
 
@@ -294,6 +294,6 @@ def _cap_from_disc(disc: NDArray[Any], height: int) -> NDArray[np.bool_]:
     """A disc map as a mask of a panorama (height, 2 height); False outside the disc."""
     colatitude = (np.arange(height) + 0.5) * 180 / height
     azimuth = np.radians((np.arange(2 * height) + 0.5) * 180 / height)
-    x = (colatitude[:, None] * np.cos(azimuth) + _REACH) / _STEP - 0.5
-    y = (colatitude[:, None] * np.sin(azimuth) + _REACH) / _STEP - 0.5
+    x = (colatitude[:, None] * np.cos(azimuth) + _MAP_RADIUS) / _SAMPLE_DEGREES - 0.5
+    y = (colatitude[:, None] * np.sin(azimuth) + _MAP_RADIUS) / _SAMPLE_DEGREES - 0.5
     return cv2.remap(disc, x.astype(np.float32), y.astype(np.float32), cv2.INTER_NEAREST) > 0

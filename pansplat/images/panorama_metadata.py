@@ -26,7 +26,7 @@ Stereo = Literal["mono", "top-bottom"]
 
 _PACKETS = "xmp", "XML:com.adobe.xmp"  # where Pillow stores the packet, by the file's format
 _TAG = re.compile(r"(?<!/)GPano:(\w+)\s*(?:=\s*[\"']([^\"']*)[\"']|>([^<]*)<)")
-_SHAPE_TOLERANCE = 0.01  # of the proportions that the tags state
+_SHAPE_TOLERANCE = 0.01  # largest relative error of the proportions that the tags state
 _SPHERICAL_V1 = uuid.UUID("ffcc8263-f855-4a93-8814-587a02521fdd").bytes
 _STEREO_V2 = {"mono": b"\0", "top-bottom": b"\1"}
 _RDF = (
@@ -58,7 +58,7 @@ def make_gpano_xmp(width: int, height: int, *, is_photograph: bool = False) -> b
         "CroppedAreaLeftPixels": 0,
         "CroppedAreaTopPixels": 0,
     }
-    if not is_photograph:  # of which the heading is unknown
+    if not is_photograph:  # the heading of a photograph is unknown
         properties |= {"StitchingSoftware": "pansplat", "PoseHeadingDegrees": 0}
     attributes = " ".join(f'GPano:{name}="{value}"' for name, value in properties.items())
     return (
@@ -179,4 +179,4 @@ def _make_projection(content: bytes) -> bytes:
     return _box(b"sv3d", _box(b"svhd", bytes(4) + b"pansplat\0") + _box(b"proj", header + content))
 
 
-_SPHERICAL_V2 = _make_projection(_box(b"equi", bytes(4) + bytes(16)))  # not cropped
+_SPHERICAL_V2 = _make_projection(_box(b"equi", bytes(4) + bytes(16)))  # bounds of 0: the panorama is not cropped

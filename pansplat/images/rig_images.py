@@ -28,9 +28,9 @@ from pansplat.system.strict_json import read_json
 
 RIG_SUFFIX = ".rig.json"
 
-_SAMPLES = 2  # per pixel and axis
-_CUBE_TOLERANCE = 1e-4  # radians, and of half a face
-_EDGE = 0.5  # pixels beyond the outermost pixel centres' edges that count as covered: rounding at common edges
+_SAMPLES = 2  # samples per pixel and axis
+_CUBE_TOLERANCE = 1e-4  # deviation of a cube's faces: radians, and relative to half a face
+_EDGE_MARGIN = 0.5  # pixels outside a picture that count as covered, because of rounding at common edges
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class RigImage:
             x, y = lens.fx * local[..., 0] / z + lens.cx, lens.fy * local[..., 1] / z + lens.cy
             with np.errstate(invalid="ignore"):
                 margin = np.minimum(np.minimum(x, lens.width - x) / lens.fx, np.minimum(y, lens.height - y) / lens.fy)
-                better: Bool[Array, "row column"] = (margin > best) & (margin > -_EDGE / max(lens.fx, lens.fy))
+                better: Bool[Array, "row column"] = (margin > best) & (margin > -_EDGE_MARGIN / max(lens.fx, lens.fy))
             best[better] = margin[better]
             chosen[better] = number
         return chosen

@@ -62,7 +62,7 @@ def write_video(
                 container.mux(packet)
         if panorama:
             mark_spherical_video(temporary, stereo)
-        with open(temporary, "ab") as file:  # a box that players skip
+        with open(temporary, "ab") as file:  # players skip a box of this type
             file.write((8 + len(SOFTWARE)).to_bytes(4, "big") + b"free" + SOFTWARE.encode())
     return count
 

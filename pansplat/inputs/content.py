@@ -30,7 +30,7 @@ def hash_image(image: Path) -> str:
 def hash_pixels(panoramas: Iterable[Panorama], siblings: tuple[Path, ...]) -> str:
     """A hash of all that decides which pixels are read of panoramas, and which of them show the scene."""
     views, others = tuple(panoramas), []
-    if any(view.mask is None for view in views):  # what moves with the camera is found in the siblings
+    if any(view.mask is None for view in views):  # what moves with the camera is found by comparison with the siblings
         others = [hash_image(image) for image in sample_files(siblings)]
     stated = [(hash_image(view.image), view.mask and hash_file(view.mask), view.is_scan) for view in views]
     return hash_parts(_hash_code(), json.dumps([stated, others]))

@@ -54,11 +54,11 @@ from pansplat.system.files import read_file
 from pansplat.system.strict_json import read_field, read_json
 
 POSES, PAIRS = "poses.json", "pairs.json"
-_MAX_WORLD = 9999  # of poses.json
+_MAX_WORLD = 9999  # largest number of a world in poses.json
 MATRIX_KEYS = ("cam2world", "world2cam", "pose")
-_IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # of a sequence
+_IMAGE_FOLDERS = ("image", "images", "panos", "frames", ".")  # folders of a sequence that may hold its pictures
 _Z_UP = torch.tensor(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)), dtype=torch.float64)
-CAMERA_POSES = "camera_pose.json"  # of 360Loc
+CAMERA_POSES = "camera_pose.json"  # name of 360Loc's file
 
 
 # poses.json with an optional pairs.json: the package's own format.

@@ -25,10 +25,10 @@ from pansplat.system.files import expand_home, is_scene_file, is_written, make_u
 from pansplat.system.options import CAMERA_HEIGHT
 
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
-_RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # of 360-degree cameras, not stitched
+_RAW_SUFFIXES = (".insp", ".insv", ".360", ".dng", ".osv")  # pictures and videos of 360-degree cameras before stitching
 _UNREAD_SUFFIXES = (*_VIDEO_SUFFIXES, *_RAW_SUFFIXES, ".heic", ".heif")
-_TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # that may hold poses
-_PICTURES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # that may be masks
+_TABLE_SUFFIXES = (".csv", ".txt", ".json", ".xml", ".bin")  # files that may hold poses
+_PICTURE_SUFFIXES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # pictures that may be masks or have them
 
 _MAX_DEPTH = 4  # levels of nested folders that are searched
 
@@ -112,10 +112,10 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
         if split_mask_name(image) is not None:
             raise InputError(f"{image}: needed a panorama, got the mask of another by its name; rename or remove it.")
     folders = dict.fromkeys(_list_folders(root, _MAX_DEPTH) if root.is_dir() else [root.parent])
-    read: set[Path] = set()  # pictures
-    parts: set[Path] = set()  # of them, those that panoramas are joined from
+    read: set[Path] = set()  # pictures that are read as panoramas or parts of them
+    parts: set[Path] = set()  # pictures that panoramas are joined from; a part of `read`
     used: set[Path] = set()
-    names: dict[str, Path] = {}  # pictures by their names
+    names: dict[str, Path] = {}
     for image, view in views.items():
         pictures, place = list_pictures(image), locate_panorama(image)
         parts |= {picture.resolve() for picture in pictures} - {image.resolve()}
@@ -124,11 +124,11 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
         folders |= dict.fromkeys(folder for file in places for folder in (file.parent, file.resolve().parent))
         used |= {mask.resolve() for mask in (view.mask, *list_masks(image, check=True)) if mask is not None}
         names[fold_name(view.name)] = place
-    used |= parts  # among them are masks of perspective pictures
+    used |= parts  # masks of perspective pictures are among them
     listed = ((folder, name) for folder in folders for name in sorted(next(os.walk(folder), ("", [], []))[2]))
     files = [folder / name for folder, name in listed if not (name.startswith(".") or is_scene_file(name))]
     masks = {file: name for file in files if (name := split_mask_name(file)) and file.resolve() not in used}
-    pictures = [file for file in files if file.suffix.lower() in _PICTURES and not split_mask_name(file)]
+    pictures = [file for file in files if file.suffix.lower() in _PICTURE_SUFFIXES and not split_mask_name(file)]
     names |= {fold_name(picture.stem): picture for picture in pictures if picture.resolve() not in parts}
     for mask, (stem, kind) in masks.items():
         own = [
@@ -139,7 +139,7 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
         shown = parts if kind == MASK_SUFFIX else read
         is_spare = (stem or kind == MASK_SUFFIX) and shown.isdisjoint(file.resolve() for file in own)
         if (is_named and is_spare and mask.suffix.lower() == ".png") or not (
-            is_named or mask.suffix.lower() in _PICTURES
+            is_named or mask.suffix.lower() in _PICTURE_SUFFIXES
         ):
             continue
         near = [names[name] for name in difflib.get_close_matches(fold_name(stem), names, n=1)]
@@ -233,7 +233,7 @@ def _link(collections: Sequence[Collection]) -> list[Collection]:
     """The collections of one folder with what its links.json states."""
     views = linked = [view for found in collections for view in found.views]
     folder = collections[0].folder
-    for place in dict.fromkeys((folder, *(source.parent for source in find_web_tours(folder)))):  # a tour's data
+    for place in dict.fromkeys((folder, *(source.parent for source in find_web_tours(folder)))):  # folders of tours
         linked = add_links(linked, place)
     of = dict(zip(views, linked, strict=True))
     return [

@@ -36,8 +36,8 @@ FAR_SEQUENCE = 50.0  # metres; for halls (docs/official.md, section 2.2)
 
 MAX_CONTEXT = 64  # context panoramas of a pair
 
-MAX_NAMES = 20  # in a note
-_MATCHING_SECONDS = 2.0  # for two panoramas of 512 rows on two cores
+MAX_NAMES = 20  # names that a note lists
+_MATCHING_SECONDS = 2.0  # time to match two panoramas of 512 rows on two cores
 
 
 @dataclass(frozen=True)
@@ -344,7 +344,7 @@ class Collection:
         if self.ordered or count == 2:
             return list(itertools.pairwise(members))
         centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
-        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)  # Prim's algorithm; a grid has equal ones
+        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)  # Prim's algorithm; in a grid many are equal
         parent = torch.zeros(count, dtype=torch.long)
         outside = torch.ones(count, dtype=torch.bool)
         outside[0] = False

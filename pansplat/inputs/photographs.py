@@ -66,7 +66,7 @@ def read_photographs(source: Path, folder: Path, convention: str | None = None) 
 
 def with_further(found: Collection) -> Collection:
     """A sequence or reconstruction with the panoramas beside its pictures that have no pose."""
-    if any(len(list_pictures(view.image)) > 1 for view in found.panoramas):  # joined: the others are pictures of rigs
+    if any(len(list_pictures(view.image)) > 1 for view in found.panoramas):  # other pictures are parts of rigs
         return found
     folders = tuple(dict.fromkeys(view.image.parent for view in found.panoramas))
     unposed = tuple(list_further(found.source, folders, found.panoramas))
@@ -122,7 +122,7 @@ def _identify(file: Path) -> object:
         status = file.stat()
     except OSError:
         return file.resolve()
-    return (status.st_dev, status.st_ino) if status.st_ino else file.resolve()  # 0 on some network drives
+    return (status.st_dev, status.st_ino) if status.st_ino else file.resolve()  # the number is 0 on some network drives
 
 
 def _warn_left_out(problems: Sequence[str]) -> None:

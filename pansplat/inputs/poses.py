@@ -29,8 +29,8 @@ _DIRECTIONS = {
     "world2cam": r"world[ _-]?(2|to)[ _-]?cam(era)?|\bw2c\b",
 }
 _AXES = {"opencv": r"opencv|colmap", "opengl": r"opengl|habitat|blender|nerf"}
-_MAX_NUMBER_BYTES = 1 << 16  # of a text file with one number
-_EXACT = 1e-9  # error of a rotation that is kept
+_MAX_NUMBER_BYTES = 1 << 16  # bytes of a text file that should hold one number
+_ROUNDING_ERROR = 1e-9  # a rotation with a larger error is replaced by the nearest exact one
 _RIGID_TOLERANCE = 1e-2  # for files with 4 to 6 decimals; errors of wrong matrices are far larger
 _OPENGL_TO_OPENCV = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 
@@ -74,7 +74,7 @@ def rigid_matrix(values: Any, source: str) -> Float[Tensor, "4 4"]:
             f"{source}: needed a position of at most {MAX_POSITION:g} metres from the origin, got {farthest:g}; "
             "correct it."
         )
-    return _nearest_rigid(matrix) if error > _EXACT else matrix
+    return _nearest_rigid(matrix) if error > _ROUNDING_ERROR else matrix
 
 
 def _describe_error(matrix: Float[Tensor, "4 4"], error: float) -> str:

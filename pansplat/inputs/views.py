@@ -14,7 +14,7 @@ from pansplat.geometry.world import USER_FRAME, WorldFrame
 from pansplat.system.descriptions import describe_count, describe_range, list_first
 from pansplat.system.options import CAMERA_HEIGHT
 
-ONE_POSITION = 1e-3  # largest distance of cameras without parallax, relative to near
+ONE_POSITION = 1e-3  # distance between cameras, relative to near, up to which they have no parallax
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,8 +47,8 @@ from pansplat.model.layers import (
 _UNET_SCALES = 3
 _UNET_MULTIPLE = 2 ** (_UNET_SCALES - 1)
 
-_GROUPS = 8  # of the group normalisation
-_HEAD_CHANNELS = 32  # of one attention head
+_GROUPS = 8  # groups of the group normalisation
+_HEAD_CHANNELS = 32  # channels of one attention head
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,10 @@ from pansplat.model.tiles import (
     sample_window,
 )
 
-_SCALE_UNIT = 0.2  # a scale of 1, in map pixels
+_SCALE_UNIT = 0.2  # pixels of the map that a scale of 1 stands for
 # The polar axis of the network's harmonics is y: their k-th function of d is the 3DGS function of _POLAR_Y @ d.
 _POLAR_Y = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-_MAX_HEIGHT = 512  # of the cost volume's input
+_MAX_HEIGHT = 512  # rows of the cost volume's input
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class LevelHead(nn.Module):
     def forward(self, inputs: Sequence[Float[Tensor, "_ height width"]]) -> Float[Tensor, "1 hidden h w"]:
         kind = inputs[0].device.type
         dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
-        maps = concatenate_channels(inputs, dtype)  # the largest map: freed after the first convolution
+        maps = concatenate_channels(inputs, dtype)  # the largest map is freed after the first convolution
         for index, conv in enumerate(self.convs):
             if index > 0:
                 maps = functional.gelu(maps)
@@ -410,7 +410,7 @@ def adapt_gaussians(
     scales = config.min_scale + (config.max_scale - config.min_scale) * torch.sigmoid(scale_part)
     pixel_radians = math.pi / map_height
     # The official normalisation: a zero quaternion stays zero.
-    quats = rotation_part.roll(1, dims=-1)  # xyzw to wxyz
+    quats = rotation_part.roll(1, dims=-1)  # the network's order is xyzw, ours wxyz
     quats = quats / (quats.norm(dim=-1, keepdim=True) + 1e-8)
     camera_quat = quats_from_rotations(camera).to(quats)
     return Gaussians(

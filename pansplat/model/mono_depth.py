@@ -35,11 +35,11 @@ from pansplat.model.layers import (
     to_channels_last,
 )
 
-HEIGHT, FACE_SIZE = 512, 256  # of the encoders' inputs
-SCALES = (5, 4, 3, 2, 1)  # coarse to fine: 1/32 to 1/2 of the panorama
+HEIGHT, FACE_SIZE = 512, 256  # rows of the encoders' panorama, and pixels along their faces
+SCALES = (5, 4, 3, 2, 1)  # from coarse to fine: 1/32 to 1/2 of the panorama's size
 FEATURE_CHANNELS = 32
 _ENCODED = {5: 512, 4: 256, 3: 128, 2: 64, 1: 64}  # channels of each encoder
-_DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after upsampling from a scale
+_DECODED = {5: 256, 4: 128, 3: 64, 2: 32}  # channels after the upsampling from a scale
 
 
 class MonocularDepth(nn.Module):

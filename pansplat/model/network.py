@@ -37,9 +37,9 @@ from pansplat.system.devices import choose_device, note_full_card
 from pansplat.system.progress import report_progress
 from pansplat.system.source_hash import hash_sources
 
-_UNTILED_HEIGHT = 512  # above, the number of tiles along each side doubles with the height
-_MULTIPLE = 32  # divides the working height: levels, windows and their shifts
-_MATCHING_FRACTION = 0.4  # of the prediction time, for the progress report
+_UNTILED_HEIGHT = 512  # rows; above, the number of tiles along each side doubles with the height
+_HEIGHT_MULTIPLE = 32  # divides the working height, for levels, windows and their shifts
+_MATCHING_FRACTION = 0.4  # fraction of the prediction's time that matching takes, for the progress
 
 
 class NetworkPredictor:
@@ -138,14 +138,14 @@ class NetworkPredictor:
         tiles = first = self.tiles or choose_tiles(images.shape[-2])
         done, parts = 0, None
         while True:
-            with torch.no_grad():  # closed before each yield: the caller keeps its own grad mode
+            with torch.no_grad():  # the block ends before each yield, so that the caller keeps its own mode
                 try:
                     if parts is None:
                         matched = self._match(images, cam2world, near, far, masks, tiles)
                         parts = itertools.islice(self._lift(matched, tiles), done, None)
                     part = next(parts, None)
-                except torch.cuda.OutOfMemoryError:  # of a graphics card only
-                    matched = parts = None  # frees the maps on the card
+                except torch.cuda.OutOfMemoryError:  # only a graphics card raises it
+                    matched = parts = None
                     if done == 0 and tiles < 4 * first:
                         tiles *= 2
                         note_full_card(self.name, f"{tiles}x{tiles} tiles")
@@ -174,7 +174,7 @@ class NetworkPredictor:
         _check_inputs(images, cam2world, low, high, masks, self.network.compat)
         report_progress("matching views", 0.0)
         weight = next(self.network.parameters())
-        images, _ = fit_panoramas(images, None, max(_MULTIPLE, 8 * tiles))
+        images, _ = fit_panoramas(images, None, max(_HEIGHT_MULTIPLE, 8 * tiles))
         pose = cam2world.to(device=weight.device, dtype=weight.dtype)
         near_views, far_views = (bound.to(weight).expand(views)[None] for bound in (low, high))
         return self.network.match_views(images.to(weight)[None], pose[None], near_views, far_views)

@@ -46,11 +46,11 @@ _Layer = tuple[str, str, tuple[str, ...]]  # official name, our name, tensors
 _BARE = ("weight",)
 _FULL = ("weight", "bias")
 _BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
-_PREFIX = "encoder."  # of the network's tensors in a Lightning checkpoint
+_PREFIX = "encoder."  # prefix of the network's tensors in a Lightning checkpoint
 _AUXILIARY_PREFIX = "losses.2.gaussian_head."
 _GRID_HEIGHTS = {f"mono_depth.c2e.{scale}.sample_grid": 512 >> scale for scale in (5, 4, 3, 2, 1)}
 """Heights of the panoramas of the stored lookup grids, which are recomputed here."""
-_MAX_NAMES = 4  # in an error message
+_MAX_NAMES = 4  # names that an error message lists
 
 
 class UnsafeCheckpointError(InputError):
@@ -106,7 +106,7 @@ def load_weights(path: str | Path) -> WeightsFile:
             metadata = file.metadata() or {}
             # Copies: the tensors are maps of the file, which Windows could not replace and a writer would change.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118  # not a dict
-    except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # types that torch lacks
+    except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # torch lacks some types
         raise InputError(f"{path}: needed a whole .safetensors file, got '{error}'; {_suggest_remedy(path)}") from error
     if not {"pansplat_format", "model", "config", "compat"} <= metadata.keys():
         raise InputError(

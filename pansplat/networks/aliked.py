@@ -20,14 +20,14 @@ from torch.nn import functional
 
 from pansplat.model.layers import to_channels_last
 
-_CHANNELS = (16, 32, 64, 128)  # of the levels
-_STRIDES = (1, 2, 8, 32)  # of the levels, pixels
-_LEVEL_FEATURES = 32  # of each level in a pixel's features
+_CHANNELS = (16, 32, 64, 128)  # channels of the levels
+_STRIDES = (1, 2, 8, 32)  # pixels; steps of the levels
+_LEVEL_FEATURES = 32  # features of a pixel that each level gives
 DESCRIPTOR = 4 * _LEVEL_FEATURES
-_POSITIONS = 16  # of a descriptor
-_RADIUS = 2  # of the local maxima, pixels
-_TEMPERATURE = 0.1  # of the scores around a maximum, for its position
-_MAX_OFFSET = 0.25  # of the image's longer side; offsets of deformed kernels are clamped to it
+_SAMPLES = 16  # positions in the image that a descriptor is made of
+_RADIUS = 2  # pixels; a keypoint has the largest score within this distance
+_TEMPERATURE = 0.1  # temperature of the softmax of the scores around a keypoint, which gives its position
+_MAX_OFFSET = 0.25  # largest offset of a deformed kernel, relative to the image's longer side
 
 Levels = list[Float[Tensor, "1 32 _ _"]]
 """Features of the four levels at their own resolution; a pixel's features are all four, interpolated."""
@@ -44,7 +44,7 @@ class DeformedConv(nn.Module):
     def forward(self, maps: Float[Tensor, "image channel h w"]) -> Float[Tensor, "image out h w"]:
         count, channels, height, width = maps.shape
         limit = _MAX_OFFSET * max(height, width)
-        offset = self.offset(maps).clamp(-limit, limit).unflatten(1, (9, 2))  # of each sample: y, x
+        offset = self.offset(maps).clamp(-limit, limit).unflatten(1, (9, 2))  # offset of each sample: y, x
         rows = torch.arange(height, dtype=maps.dtype, device=maps.device)[:, None]
         columns = torch.arange(width, dtype=maps.dtype, device=maps.device)
         tap = torch.arange(9, dtype=torch.long, device=maps.device)[:, None, None]
@@ -84,9 +84,9 @@ class Aliked(nn.Module):
             nn.Conv2d(before, after, size, padding=size // 2, bias=False)
             for before, after, size in ((DESCRIPTOR, 8, 1), (8, 4, 3), (4, 4, 3), (4, 1, 3))
         )
-        self.offset = nn.ModuleList((nn.Conv2d(DESCRIPTOR, 2 * _POSITIONS, 3), nn.Linear(32, 2 * _POSITIONS)))
+        self.offset = nn.ModuleList((nn.Conv2d(DESCRIPTOR, 2 * _SAMPLES, 3), nn.Linear(32, 2 * _SAMPLES)))
         self.mix = nn.Linear(DESCRIPTOR, DESCRIPTOR, bias=False)
-        self.aggregate = nn.Parameter(torch.zeros(_POSITIONS, DESCRIPTOR, DESCRIPTOR))
+        self.aggregate = nn.Parameter(torch.zeros(_SAMPLES, DESCRIPTOR, DESCRIPTOR))
 
     def forward(
         self, image: Float[Tensor, "3 h w"], allowed: Bool[Tensor, "h w"], count: int
@@ -130,12 +130,12 @@ class Aliked(nn.Module):
         """Unit descriptors of keypoints."""
         height, width = levels[0].shape[-2:]
         steps = torch.arange(3, device=points.device) - 1
-        square = torch.stack((steps.repeat(3), steps.repeat_interleave(3)), dim=-1)  # x, y of the 3x3 pixels
+        square = torch.stack((steps.repeat(3), steps.repeat_interleave(3)), dim=-1)  # x, y of 3x3 pixels
         centre = points.long().clamp(min=1).minimum(torch.tensor((width - 3, height - 3), device=points.device))
         around = _pixel_features(levels, (centre[:, None] + square).flatten(0, 1)).unflatten(0, (-1, 9))
         offset = functional.selu(self.offset[0](around.mT.unflatten(2, (3, 3)))[:, :, 0, 0])
         limit = _MAX_OFFSET * max(height, width)
-        offset = self.offset[1](offset).clamp(-limit, limit).unflatten(1, (2, _POSITIONS)).mT
+        offset = self.offset[1](offset).clamp(-limit, limit).unflatten(1, (2, _SAMPLES)).mT
         positions = (points[:, None] + offset).flatten(0, 1)
         corner = positions.floor()
         x, y = (positions - corner).unbind(dim=1)
@@ -144,7 +144,7 @@ class Aliked(nn.Module):
             weight = (x if step_x else 1 - x) * (y if step_y else 1 - y)
             pixels = corner.long() + torch.tensor((step_x, step_y), device=points.device)
             samples += weight[:, None] * _pixel_features(levels, pixels)
-        samples = functional.selu(self.mix(samples)).view(len(points), _POSITIONS * DESCRIPTOR)
+        samples = functional.selu(self.mix(samples)).view(len(points), _SAMPLES * DESCRIPTOR)
         return functional.normalize(samples @ self.aggregate.flatten(0, 1), dim=1)
 
 
@@ -172,7 +172,7 @@ def find_keypoints(
     inner[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] = allowed[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
     peaks = torch.where(_local_maxima(scores) & inner, scores, 0.0).flatten()
     places = peaks.nonzero()[:, 0]
-    index = places[peaks[places].argsort(descending=True, stable=True)[:count]]  # equal ones by place
+    index = places[peaks[places].argsort(descending=True, stable=True)[:count]]  # equal scores keep the order of places
     steps = torch.arange(-_RADIUS, _RADIUS + 1, device=scores.device)
     square = torch.stack((steps.repeat(5), steps.repeat_interleave(5)), dim=-1)
     around = scores.flatten()[index[:, None] + square[:, 0] + width * square[:, 1]]

@@ -23,8 +23,8 @@ from torch.nn.functional import interpolate, relu
 from pansplat.model.layers import PanoramaConv2d, Size, TwoConvs, attend, convolve_and_normalize
 from pansplat.networks.efficientnet import CHANNELS, EfficientNetLite0
 
-MAX_LOG_SCALE = 3.0  # bound of the logarithm of the Laplace scale
-MEAN_LOG_DEPTH = 0.6  # of generated homes, in camera heights
+MAX_LOG_SCALE = 3.0  # limit of the logarithm of the Laplace scale
+MEAN_LOG_DEPTH = 0.6  # mean log-depth of the generated homes that it was trained on, in camera heights
 
 
 @dataclass(frozen=True)

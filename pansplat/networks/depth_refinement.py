@@ -34,7 +34,7 @@ from pansplat.networks.depth_network import (
 )
 from pansplat.networks.efficientnet import CHANNELS
 
-_PATCH, _DILATION = 3, 2  # pixels of a patch, and their distance
+_PATCH, _PATCH_STEP = 3, 2  # width of a patch, and pixels between its samples
 _PATCH_NOISE = 0.02  # standard deviation of a patch below which its correlation fades
 _AGREEMENT_SCALE = 0.1  # ratio of log-distances at which a candidate is clearly before or behind a surface
 
@@ -192,8 +192,8 @@ def _make_patches(images: Float[Tensor, "view 3 h w"]) -> Float[Tensor, "view c 
     """Grey patches of each pixel with mean 0 and norm 1, or less in patches without texture."""
     height, width = images.shape[-2:]
     grey = images.mean(dim=1, keepdim=True)
-    padded = pad_equirect(grey, _PATCH // 2 * _DILATION, "sphere")
-    patches = unfold(padded, _PATCH, dilation=_DILATION).unflatten(-1, (height, width))
+    padded = pad_equirect(grey, _PATCH // 2 * _PATCH_STEP, "sphere")
+    patches = unfold(padded, _PATCH, dilation=_PATCH_STEP).unflatten(-1, (height, width))
     patches = patches - patches.mean(dim=1, keepdim=True)
     deviation = patches.square().sum(dim=1, keepdim=True)
     return patches / (deviation + _PATCH**2 * _PATCH_NOISE**2).sqrt()

@@ -27,7 +27,7 @@ from pansplat.networks.depth_network import (
 )
 
 _ESTIMATE_CHANNELS = 3  # log-depth, its log-scale, latitude
-_NEIGHBOURS = 9  # whose depths a pixel chooses from
+_NEIGHBOURS = 9  # pixels around a pixel and itself, whose depths it chooses from
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from torch.nn.functional import relu6
 
 from pansplat.model.layers import PanoramaConv2d, convolve_and_normalize
 
-_EPSILON, _MOMENTUM = 1e-3, 0.01  # of batch normalisation
-_STEM = 32
+_EPSILON, _MOMENTUM = 1e-3, 0.01  # settings of batch normalisation
+_STEM_CHANNELS = 32
 
 
 class Stage(NamedTuple):
@@ -36,8 +36,8 @@ STAGES = (
     Stage(5, 2, 6, 192, 4),
     Stage(3, 1, 6, 320, 1),
 )
-_OUTPUTS = (0, 1, 2, 4, 6)  # the last stage of each scale
-CHANNELS = tuple(STAGES[n].channels for n in _OUTPUTS)  # at 1/2, 1/4, 1/8, 1/16 and 1/32
+_OUTPUTS = (0, 1, 2, 4, 6)  # the last stage of each scale; its maps are an output
+CHANNELS = tuple(STAGES[n].channels for n in _OUTPUTS)  # at 1/2, 1/4, 1/8, 1/16 and 1/32 size
 
 
 class InvertedResidual(nn.Module):
@@ -73,11 +73,11 @@ class EfficientNetLite0(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = PanoramaConv2d(3, _STEM, 3, border="sphere", stride=2, bias=False)
-        self.stem_norm = _make_norm(_STEM)
+        self.stem = PanoramaConv2d(3, _STEM_CHANNELS, 3, border="sphere", stride=2, bias=False)
+        self.stem_norm = _make_norm(_STEM_CHANNELS)
         self.blocks = nn.ModuleList()
         self._last_of_stage: list[int] = []
-        width = _STEM
+        width = _STEM_CHANNELS
         for stage in STAGES:
             for n in range(stage.blocks):
                 stride = stage.stride if n == 0 else 1

@@ -18,8 +18,8 @@ from torch.nn import functional
 
 _LAYERS, _HEADS, _WIDTH = 9, 4, 256
 _HEAD_WIDTH = _WIDTH // _HEADS
-_STOP_SHARE = 0.95  # of confident keypoints at which the network stops
-_MIN_MATCHABLE = 0.01  # probability to have a partner below which a confident keypoint is dropped
+_STOP_SHARE = 0.95  # the network stops when so many of the keypoints are confident
+_MIN_MATCHABLE = 0.01  # a confident keypoint with a lower probability to have a partner is dropped
 
 Keypoints = Float[Tensor, "_ 256"]
 """States of the keypoints of one image."""

@@ -18,11 +18,11 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.system.files import expand_home, read_file
 
-_DEFAULT_SIZE = 518  # pixels, of networks of any size; 14 divides it
+_DEFAULT_SIZE = 518  # rows of the input of networks that take any size; 14 divides it
 _NEEDED = (
     "a network with one float32 image (1, 3, h, w) as its input and relative inverse depth (1, h, w) as its output"
 )
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # mean and deviation of ImageNet's colours
 
 
 class RelativeDepthNetwork:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-_MIN_EPSILON = 1e-15  # against a division by 0
+_MIN_EPSILON = 1e-15  # smallest epsilon of Adam, against a division by 0
 
 
 @dataclass(eq=False)

@@ -24,13 +24,13 @@ from pansplat.geometry.morton import morton_codes
 from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_rotations
 from pansplat.rendering.weights import compute_blending_weights
 
-DROP_ERROR = 5e-3  # largest mean absolute change of an image by all Gaussians that are dropped
+DROP_ERROR = 5e-3  # largest mean absolute change of an image's colours by all Gaussians that are dropped
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at, here and in the steps of a refinement
-_MAX_MERGED_OPACITY = 0.99  # of a merged Gaussian; larger ones make it wider
-_DIRECTION_BITS = 15  # of half a component of a direction, in the cells of a Z-order curve
-_SEARCHED = 8  # Gaussians before and after a Gaussian along the curve
+_MAX_MERGED_OPACITY = 0.99  # a merged Gaussian with more opacity becomes wider (docs/refinement.md)
+_DIRECTION_BITS = 15  # a half axis of the cells of directions, on a Z-order curve, has 2^15 steps
+_NEIGHBOURS = 8  # candidates for a merger before and after a Gaussian along the curve
 _BASE_COST = 0.008  # cost of a merger between equal Gaussians, as a difference of colours
-_MERGED = 0.5  # part of the pairs of a round that is merged; in the next round the others have better neighbours
+_MERGED_SHARE = 0.5  # share of a round's pairs that is merged (docs/what_was_tried.md)
 
 
 def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
@@ -38,7 +38,7 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
 
     The images are at the view's own camera, at the nearest other ones, and halfway to them.
     """
-    size = (max(size[0] // 2, 1), max(size[1] // 2, 1))  # a quarter of the time; the filter conserves energy
+    size = (max(size[0] // 2, 1), max(size[1] // 2, 1))  # this takes a quarter of the time; the filter conserves energy
     gaussians, poses = scene.gaussians, scene.cam2world
     largest = torch.zeros_like(gaussians.opacities)
     area = row_weights(size[0]).to(largest)[None, :, None].expand(1, *size)
@@ -102,7 +102,7 @@ def merge_to(scene: Scene, size: tuple[int, int], count: int) -> Scene:
             parts = parts.select(best)
             break
         cost = _merge_cost(parts.gaussians, contributions, first, second)
-        chosen = cost.argsort(stable=True)[: min(surplus, math.ceil(_MERGED * len(cost)))]
+        chosen = cost.argsort(stable=True)[: min(surplus, math.ceil(_MERGED_SHARE * len(cost)))]
         first, second = first[chosen], second[chosen]
         is_kept = torch.ones_like(contributions, dtype=torch.bool)
         is_kept[first] = is_kept[second] = False
@@ -178,7 +178,7 @@ def _find_mutual_neighbours(
     order = np.lexsort((morton_codes(cells.astype(np.int64)), labels))
     features, labels = features[order], labels[order]
     least, nearest = np.full(len(order), np.inf, np.float32), np.full(len(order), -1)
-    for step in range(1, min(_SEARCHED, len(order) - 1) + 1):
+    for step in range(1, min(_NEIGHBOURS, len(order) - 1) + 1):
         square = np.square(features[step:] - features[:-step]).sum(axis=1)
         square[labels[step:] != labels[:-step]] = np.inf
         for here, there in ((slice(None, -step), step), (slice(step, None), -step)):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pansplat.rendering.cpu.runtime import inline_kernel_no_refcount, kernel, parallel_for, pooled_empty, thread_count
 
-_ROWS_PER_ITEM = 16  # of an image, for one thread
+_ROWS_PER_ITEM = 16  # rows of an image that a thread processes together
 _CHANNELS = 3
 
 
@@ -44,7 +44,7 @@ def _compare_rows(error, pixels, right, below, gradient, totals, item):
     height, width = pixels.shape
     terms = np.empty(width, np.float32)
     for y in range(item * _ROWS_PER_ITEM, min((item + 1) * _ROWS_PER_ITEM, height)):
-        above, under = max(y - 1, 0), min(y + 1, height - 1)  # at the poles a row minus itself is 0
+        above, under = max(y - 1, 0), min(y + 1, height - 1)  # a pole's row minus itself is 0
         for x in range(width):
             terms[x] = 0
         for channel in range(len(error)):

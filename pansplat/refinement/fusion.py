@@ -23,9 +23,9 @@ from pansplat.geometry.equirect import pad_equirect, uv_from_directions
 from pansplat.rendering import rasterize
 
 _HEIGHT = 512  # rows of the depth of a view's surface
-_TOLERANCE = 0.1  # of a distance from the surface, relative to its depth
+_MAX_OFFSET = 0.1  # largest distance of a Gaussian from a surface that it belongs to, relative to the surface's depth
 BACKGROUND_LEVEL = 2  # the finest level of the background
-OPAQUE = 0.5  # least alpha of a surface
+OPAQUE = 0.5  # least alpha of a pixel that shows a surface
 
 
 @torch.no_grad()
@@ -76,4 +76,4 @@ def are_seen(
     offsets = (points.double() - pose[:3, 3].to(points.device)) @ pose[:3, :3].to(points.device)
     uv = uv_from_directions(offsets)
     row = (uv[:, 1] * height).long().clamp(0, height - 1)
-    return offsets.norm(dim=1) <= (1 + _TOLERANCE) * reach[row, (uv[:, 0] * width).long() % width]
+    return offsets.norm(dim=1) <= (1 + _MAX_OFFSET) * reach[row, (uv[:, 0] * width).long() % width]

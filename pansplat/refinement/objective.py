@@ -18,7 +18,7 @@ from torch.nn import functional
 from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
 from pansplat.rendering import Rendering
 
-_BLOCKS = 32  # rows of held-out blocks
+_BLOCK_ROWS = 32  # most rows of blocks of a photograph, some of which are held out
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Photograph:
     ) -> Photograph:
         """Hold out a fraction of the blocks, chosen at random."""
         height, width = mask.shape
-        rows = min(_BLOCKS, height)
+        rows = min(_BLOCK_ROWS, height)
         blocks = (torch.rand(1, 1, rows, 2 * rows, generator=generator) < fraction).to(mask.device)
         held_out = functional.interpolate(blocks.float(), (height, width), mode="nearest")[0, 0] > 0
         whole = PixelWeights.from_mask(mask)
@@ -77,7 +77,7 @@ class Photograph:
 def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeights) -> Float[Tensor, ""]:
     """Mean absolute error of the colours, plus the mean of those of the gradients to the right and downwards."""
     if error.device.type == "cpu" and error.dtype == torch.float32:
-        from pansplat.refinement.difference import Difference  # not at the top: a GPU needs no numba
+        from pansplat.refinement.difference import Difference  # imported here, because a GPU needs no numba
 
         return Difference.apply(error, weights.pixels, weights.right, weights.below)
     colors = (error.abs().mean(0) * weights.pixels).sum()

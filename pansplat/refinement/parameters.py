@@ -12,25 +12,25 @@ from torch import Tensor
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.pose import invert_pose, multiply_quats, quats_from_rotations, rotations_from_quats
 
-_MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY = 1e-3, 0.999  # whose logit is refined
+_MIN_REFINED_OPACITY, _MAX_REFINED_OPACITY = 1e-3, 0.999  # the logits of opacities are refined between these
 # Largest decrease and increase of the logarithms of distances and scales, of quaternions, and of logits. Without them
-# exposures and wrong shapes are explained by veils and specks between the cameras, which no photograph shows.
+# exposures and wrong shapes are explained by veils and specks between the cameras (docs/refinement.md).
 _BOUNDS = {"distance": (0.1, 0.1), "scale": (3.0, 0.3), "rotation": (1.0, 1.0), "opacity": (10.0, 0.7)}
-_LAYER_FREEDOM = 3.0  # factor of the bounds of Gaussians that are drawn without those of other views
-_FREE_PARALLAX = 0.7  # baseline over distance; above it bounds fall with its fourth power
-_MIN_SCALE = 1e-9  # relative to the distance
-_MIN_DISTANCE = 1e-6  # metres
-_SPLIT_SHIFT, _SPLIT_SCALE = 0.5, 0.7  # of the halves of a split Gaussian along its longest axis, relative to its scale
+_LAYER_FREEDOM = 3.0  # factor of the bounds for Gaussians that are drawn without those of other views
+_FREE_PARALLAX = 0.7  # baseline over distance above which bounds fall with its fourth power (docs/refinement.md)
+_MIN_SCALE = 1e-9  # smallest scale, relative to the distance
+_MIN_DISTANCE = 1e-6  # smallest distance from the source camera, metres
+_SPLIT_SHIFT, _SPLIT_SCALE = 0.5, 0.7  # halves of a split Gaussian: shift and scale along its longest axis, in scales
 
 
 LEARNING_RATES = {
-    "distance": 0.008,  # of the logarithm of the distance from the source camera
-    "scale": 0.24,  # of the logarithms of the scales
-    "rotation": 0.04,  # of the unit quaternions
-    "opacity": 0.12,  # of the logits of the opacities
-    "color": 0.02,  # of the harmonics of degree 0
-    "harmonics": 0.002,  # of the harmonics of higher degree
-    "pose": 0.0005,  # of the cameras' rotations, radians, and of their positions relative to the baseline
+    "distance": 0.008,  # logarithm of the distance from the source camera
+    "scale": 0.24,  # logarithms of the scales
+    "rotation": 0.04,  # unit quaternions
+    "opacity": 0.12,  # logits of the opacities
+    "color": 0.02,  # harmonics of degree 0
+    "harmonics": 0.002,  # harmonics of higher degree
+    "pose": 0.0005,  # the cameras' rotations in radians, and their positions relative to the baseline
 }
 """Step sizes of Adam at the start of a refinement; they fall to a fraction along a cosine."""
 
@@ -127,7 +127,7 @@ class CameraParameters:
     """
 
     def __init__(self, cam2world: Float[Tensor, "view 4 4"], *, correct_poses: bool) -> None:
-        self.cam2world = cam2world.double().clone()  # no tensor of torch.inference_mode
+        self.cam2world = cam2world.double().clone()  # a copy, since a tensor of torch.inference_mode has no gradient
         positions = self.cam2world[:, :3, 3]
         self._baseline = float(torch.pdist(positions).max()) if len(positions) > 1 else 0.0
         self.twists = torch.zeros(

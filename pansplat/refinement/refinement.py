@@ -48,30 +48,30 @@ from pansplat.system.source_hash import hash_sources
 # Largest height of the images that are compared, at least that of a display: fitted at the rows of the prediction,
 # edges are rows of dots in larger images (docs/refinement.md). Colours are fitted at the photographs' own height.
 DISPLAY_HEIGHT = 1024
-_CONTRIBUTION_HEIGHT = 512  # largest of the images by which Gaussians are merged and dropped
-_HELD_OUT = 0.04  # fraction of the blocks of the photographs
-_SPLIT_ERROR = 0.1  # least sum of a split Gaussian's absolute errors times its blending weights, pixels
-# Decay of Adam's averages of the gradients and of their squares: short ones, since a run has tens of steps. Wrong poses
-# need long ones: own and other photographs contradict each other until the poses are corrected.
+_CONTRIBUTION_HEIGHT = 512  # largest height of the images by which Gaussians are merged and dropped
+_HELD_OUT = 0.04  # fraction of the photographs' blocks that is not fitted until the release
+_SPLIT_ERROR = 0.1  # pixels; a larger sum of errors times weights splits a Gaussian (docs/refinement.md)
+# Decay of Adam's averages of the gradients and of their squares, by docs/what_was_tried.md. Wrong poses need long ones:
+# own and other photographs contradict each other until the poses are corrected.
 _BETAS, _POSE_BETAS = (0.5, 0.95), (0.9, 0.99)
 # Adam's epsilon relative to the root mean square of the first gradients, for photographs that are compared at their own
 # size; it grows with the number of their pixels. Gaussians of little effect move less.
 _DAMPING = 0.2
-_STEPS_SHARE = 0.65  # of the progress, that the steps are; the rest is the fit of colours (the sample on two cores)
-_RATE_FLOOR = 0.05  # of the learning rates at the end
-_HOLD = 20.0  # weight of the mean squared change of the logarithms of distances
-_POSE_HOLD = 100.0  # weight of the squared corrections of poses, in radians and relative to the baseline
-_RELEASE = 0.75  # fraction of the run after which held-out blocks are fitted too
+_STEPS_PROGRESS = 0.65  # progress after the steps; the fit of colours takes the rest (the sample on two cores)
+_RATE_FLOOR = 0.05  # factor of the learning rates at the end
+_DISTANCE_PENALTY = 20.0  # weight of the mean squared change of the logarithms of distances
+_POSE_PENALTY = 100.0  # weight of the squared corrections of poses, in radians and relative to the baseline
+_RELEASE_AT = 0.75  # fraction of the run after which held-out blocks are fitted too
 _HALF_WAY_HEIGHT = 128  # rows of the pictures between the cameras
-_STATES = 4  # of a run, whose pictures between the cameras are compared
+_NUM_STATES = 4  # states of a run whose pictures between the cameras are compared
 # Largest error of these pictures relative to the least one. The last states of generated flights, which are the best
 # against the truth, exceed it by up to 3 %; one with shards aside, of villa_8, by 7 % (docs/refinement.md).
-_ALLOWANCE = 1.05
-_SEEN = 1e-3  # least sum of the weights of a Gaussian that is seen, pixels of half the height
+_MAX_ERROR_RATIO = 1.05
+_MIN_SEEN_WEIGHT = 1e-3  # pixels of half the height; a photograph sees a Gaussian whose blending weights sum to more
 _CHECK_EVERY = 10  # steps between checks of the held-out error
-_MIN_IMPROVEMENT = 0.002  # relative decrease of the held-out error below which it stagnates
-_PATIENCE = 3  # checks without a sufficient decrease
-_POSE_TOLERANCE = 1e-3  # between the entries of the poses of scene and photographs
+_MIN_IMPROVEMENT = 0.002  # least relative decrease of the held-out error that is no stagnation
+_PATIENCE = 3  # checks in a row with stagnation that end the steps
+_POSE_TOLERANCE = 1e-3  # largest difference between entries of the poses of scene and photographs that are the same
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Refinement:
         self._groups, self._view_groups = self._group_parameters()
         self._steps = self._splits = 0
         self._seen: list[Tensor] = []
-        self._kept, self._least_error = (0, self._start), math.inf  # the best state so far: its steps, and its scene
+        self._kept, self._least_error = (0, self._start), math.inf  # the best state so far: steps, scene
         self._result: Scene | None = None
 
     def _shrink(self, images: Tensor) -> Tensor:
@@ -206,16 +206,16 @@ class Refinement:
             fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
         """
         config = self.config
-        if self._splits < len(config.splits) and config.splits[self._splits] <= fraction < _RELEASE:
+        if self._splits < len(config.splits) and config.splits[self._splits] <= fraction < _RELEASE_AT:
             self._splits += 1
             self._split()
         for group in self._groups:
             group.clear_gradients()
-        rows: Sequence[Tensor] = ()  # those that move, of the only layer of joint drawing; all in others
+        rows: Sequence[Tensor] = ()  # rows that move, of the only layer of joint drawing; in other layers all move
         for layer in self._layers:
             target = self._choose_target(layer)
             photograph = self._photographs[target]
-            weights = photograph.unmasked if fraction >= _RELEASE else photograph.fitted
+            weights = photograph.unmasked if fraction >= _RELEASE_AT else photograph.fitted
             gaussians = self._build(layer)
             moved = torch.cat([self._views[view].tensors["distance"] for view in layer.views])
             if layer.source is None:
@@ -223,9 +223,9 @@ class Refinement:
                 gaussians, moved = gaussians.select(seen), moved[seen]
                 rows = seen.split([len(parameters) for parameters in self._views.values()])
             error = self._draw(gaussians, layer, target) - photograph.image
-            (image_difference(error, weights) + _HOLD * moved.square().mean()).backward()
+            (image_difference(error, weights) + _DISTANCE_PENALTY * moved.square().mean()).backward()
         if config.poses:
-            (_POSE_HOLD * self._cameras.twists.square().sum()).backward()
+            (_POSE_PENALTY * self._cameras.twists.square().sum()).backward()
         pixels = self._images[0, 0].numel() / math.prod(self._size)
         for group in self._groups:
             group.clean_gradients()
@@ -251,11 +251,11 @@ class Refinement:
     def _find_seen(self, layer: _Layer) -> list[Tensor]:
         """Masks of a layer's Gaussians that each photograph shows. The others are not drawn: those of other rooms."""
         if not self._seen:
-            gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # a quarter of the time
+            gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # for a quarter of the time
             for target in layer.photographs:
                 weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), size)
                 everywhere = torch.ones(1, *size, device=gaussians.means.device)
-                self._seen.append(weights.accumulate(everywhere)[:, 0] > _SEEN)
+                self._seen.append(weights.accumulate(everywhere)[:, 0] > _MIN_SEEN_WEIGHT)
         return self._seen
 
     @torch.no_grad()
@@ -285,7 +285,7 @@ class Refinement:
             photograph = self._photographs[target]
             error = (self._draw(gaussians, layer, target) - photograph.image).abs().mean(0)
             error = functional.interpolate((error * photograph.fitted.pixels)[None, None], half, mode="area")[0]
-            error = error * pixels * (pixels / math.prod(half))  # of weights that sum to 1; a sum over pixels
+            error = error * pixels * (pixels / math.prod(half))  # a sum over pixels, of weights that sum to 1
             weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), half)
             errors += weights.accumulate(error)[:, 0] / len(layer.photographs) * len(layer.views)
         cameras = self._cameras.cam2world[:, :3, 3].to(gaussians.means)
@@ -336,7 +336,7 @@ class Refinement:
     def _judge_state(self) -> None:
         """Keep the present state if its pictures between the cameras are about as good as those of the best."""
         error = self.half_way_error()
-        if error <= _ALLOWANCE * self._least_error:
+        if error <= _MAX_ERROR_RATIO * self._least_error:
             self._kept = (self._steps, self.scene() if self._steps else self._start)
         self._least_error = min(self._least_error, error)
 
@@ -383,7 +383,7 @@ class Refinement:
         if not (0 < steps < math.inf and seconds > 0):
             raise InputError(f"`steps` and `seconds` of a refinement must be positive, got {steps} and {seconds}")
         start, done, total = time.perf_counter(), 0, float(steps)
-        if len(self._photographs) == 1:  # one photograph does not show what is wrong seen from elsewhere
+        if len(self._photographs) == 1:  # it does not show what is wrong seen from elsewhere
             self._result, error = self._start, self.held_out_error()
             return RefineReport(0, 0, time.perf_counter() - start, "single view", error, error)
 
@@ -396,34 +396,34 @@ class Refinement:
             if is_late or should_stop():
                 stopped = "time limit" if is_late else "interrupted"
                 break
-            report_progress("refining", _STEPS_SHARE * fraction)
-            if after is None and fraction >= _RELEASE and not self._start.joint:
+            report_progress("refining", _STEPS_PROGRESS * fraction)
+            if after is None and fraction >= _RELEASE_AT and not self._start.joint:
                 after = self.held_out_error()
             if after is not None and after > before:
                 break
             self.step(fraction)
             done += 1
-            if checked / _STATES <= done / total < 1:
+            if checked / _NUM_STATES <= done / total < 1:
                 checked += 1
                 self._judge_state()
-            if self._start.joint or done % _CHECK_EVERY or done / total >= _RELEASE:
+            if self._start.joint or done % _CHECK_EVERY or done / total >= _RELEASE_AT:
                 continue
             error = self.held_out_error()
             stale = 0 if error < best * (1 - _MIN_IMPROVEMENT) else stale + 1
             best = min(best, error)
             if stale >= _PATIENCE:
-                stopped, after, total = "converged", error, done / _RELEASE  # the last part begins now
+                stopped, after, total = "converged", error, done / _RELEASE_AT  # the release begins now
         after = self.held_out_error() if after is None else after
         if after > before:
             self._kept, stopped = (0, self._start), "worse"
         elif done:
             self._judge_state()
             stopped = stopped if self._kept[0] else "torn"
-        report_progress("fitting colours", _STEPS_SHARE)
+        report_progress("fitting colours", _STEPS_PROGRESS)
         kept, self._result = self._kept
         self._free_parameters()
         if kept:
-            detail = self._contribution_size[0] / self._images.shape[-2]  # of large photographs is in small Gaussians
+            detail = self._contribution_size[0] / self._images.shape[-2]  # large photographs need small Gaussians
             self._result = drop_unseen(self._result, self._contribution_size, detail * DROP_ERROR)
         if kept or self._start.joint:  # a fused scene has the colours of single photographs
             self._result = self._finish(self._result)

@@ -23,10 +23,10 @@ from pansplat.gaussians.harmonics import SH_0, harmonics_basis
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering.weights import BlendingWeights, compute_blending_weights
 
-_STEPS = 4  # for photographs of up to 1024 rows
-_RELAXATION = 1.8  # converges below 2
-_MIN_COVERAGE = 1e-3  # pixels
-_STORED = 2  # photographs whose weights are kept between the steps; those of one take 200 MB at 512 rows
+_STEPS = 4  # steps for photographs of up to 1024 rows; taller ones have more
+_RELAXATION = 1.8  # factor of a step, which converges below 2
+_MIN_COVERAGE = 1e-3  # least sum of a Gaussian's weights that a step is divided by, pixels
+_STORED_PHOTOGRAPHS = 2  # photographs whose weights are kept between the steps; those of one take 200 MB at 512 rows
 
 
 def count_steps(height: int) -> int:
@@ -75,7 +75,7 @@ def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tenso
     """
     change = torch.zeros_like(gaussians.harmonics[:, 0])
 
-    @functools.lru_cache(_STORED)
+    @functools.lru_cache(_STORED_PHOTOGRAPHS)
     def look(number: int) -> tuple[BlendingWeights, Tensor]:
         """The weights in a photograph, and the given colours seen from there."""
         image, pose, _ = photographs[number]

@@ -25,7 +25,7 @@ Kernel = Literal["ray", "ewa"]
 Backend = Literal["auto", "torch", "numba", "triton"]
 
 MAX_EYE_OFFSET = 1e6  # metres
-_MAX_POSE_ERROR = 1e-4  # of a rotation, see `orthonormal_error`
+_MAX_POSE_ERROR = 1e-4  # largest `orthonormal_error` of a camera's rotation
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -97,7 +97,7 @@ def _exclude_from_compile(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        if torch.compiler.is_compiling():  # only then: `disable` imports the compiler, which takes a second
+        if torch.compiler.is_compiling():  # its `disable` imports the compiler, which takes a second
             return torch.compiler.disable(function)(*args, **kwargs)
         return function(*args, **kwargs)
 

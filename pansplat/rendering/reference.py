@@ -32,11 +32,11 @@ from pansplat.system.threads import one_thread
 
 TILE_SIZE = 8  # pixels
 _BOX_MARGIN = 0.01  # pixels added around each box, far more than rounding errors
-_MAX_INTERSECTIONS = 1 << 22  # in one band of tile rows
+_MAX_INTERSECTIONS = 1 << 22  # intersections in a band of tile rows
 _BLOCK_SIZE = 32  # Gaussians in a block
-_MAX_PAIRS = 32768  # of a pixel and a Gaussian in a block, so that they fit the cache
+_MAX_PAIRS = 32768  # pairs of a pixel and a Gaussian in a block, which fit the cache
 _MIN_TRANSMITTANCE = 1e-20  # less is set to zero: float32 is slow and inexact below 1e-38
-_VALUES = 11  # first column of the values in a record, after rows, radial variance and peak
+_FIRST_VALUE = 11  # first column of the values in a record, after rows, radial variance and peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def _rasterize_columns(
         reached = torch.nonzero(reached & is_in_image(boxes, plane))[:, 0]
         footprints = Footprints(*(field[reached] for field in footprints))
         boxes = boxes[reached]
-        boxes[:, 0], boxes[:, 1] = 0, 1  # of an image of this column alone
+        boxes[:, 0], boxes[:, 1] = 0, 1  # the box of an image of this column alone
         order = torch.argsort(projected.radius.detach()[reached], stable=True)
         pixels = _arrange_points(directions[:, column : column + 1], projected.peak.dtype)
         bands = [
@@ -294,7 +294,7 @@ class _Composite(torch.autograd.Function):
         first = intersections.tiles[0]
         count = intersections.tiles[1] - first
         size = pixels.offsets.shape[-1]
-        sums = records.new_zeros(count, size, records.shape[1] - _VALUES + 1)
+        sums = records.new_zeros(count, size, records.shape[1] - _FIRST_VALUE + 1)
         kept = []
         for tiles, blocks in _group_tiles(intersections, len(records), size):
             transmittance = records.new_ones(len(tiles), size)
@@ -318,7 +318,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @one_thread()
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None, None, None, None]:
-        if torch.is_grad_enabled():  # create_graph=True
+        if torch.is_grad_enabled():  # the caller chose create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         (grad_sums,) = grad_outputs
         records, points = ctx.saved_tensors
@@ -328,7 +328,7 @@ class _Composite(torch.autograd.Function):
         groups = _group_tiles(intersections, len(records), pixels.offsets.shape[-1])
         for (tiles, blocks), before in zip(groups, kept, strict=True):
             grad_through = records.new_zeros(0, pixels.offsets.shape[-1])
-            composited = list(itertools.islice(blocks, len(before)))  # forward may have stopped early
+            composited = list(itertools.islice(blocks, len(before)))  # forward may have stopped before the last block
             for block, through in zip(reversed(composited), reversed(before), strict=True):
                 active = tiles[: len(block)]
                 record, point, centres, offsets = _gather_block(padded, block, pixels, active + intersections.tiles[0])
@@ -402,7 +402,7 @@ def _composite_block(
     behind = _zero_up_to(torch.cumprod(1 - alpha, dim=1), _MIN_TRANSMITTANCE)
     in_front = torch.cat((torch.ones_like(behind[:, :1]), behind[:, :-1]), dim=1)
     weights = alpha * in_front * through[:, None]
-    values = torch.cat((record[..., _VALUES:], torch.ones_like(record[..., :1])), dim=2)
+    values = torch.cat((record[..., _FIRST_VALUE:], torch.ones_like(record[..., :1])), dim=2)
     return _zero_up_to(through * behind[:, -1], _MIN_TRANSMITTANCE), weights.transpose(1, 2) @ values
 
 
@@ -435,7 +435,7 @@ def _evaluate_alphas(
     plane_distance = 1 + front[0]
     bounded = plane_distance.clamp_min(torch.finfo(record.dtype).eps ** 0.5)
     alpha = _clamp_alpha(torch.exp(log_peak - 0.5 * q / (bounded * bounded + record[..., 9, None] * q)))
-    if bool(plane_distance.detach().amin() > 0):  # in nearly every block
+    if bool(plane_distance.detach().amin() > 0):  # true for nearly every block
         return alpha
     return alpha * (plane_distance > 0)
 

@@ -62,11 +62,11 @@ class _DifferentiatedWeights:
 
     def accumulate(self, image: Float[Tensor, "channel height width"]) -> Float[Tensor, "n channel"]:
         with torch.inference_mode(False), torch.enable_grad():
-            harmonics = torch.zeros(  # grey, which is not clamped
+            harmonics = torch.zeros(  # half-grey is not clamped
                 len(self.gaussians), 1, len(image), dtype=image.dtype, device=image.device, requires_grad=True
             )
             gaussians = dataclasses.replace(self.gaussians, harmonics=harmonics)
             drawn = rasterize(gaussians, self.cam2world.clone(), size=self.size).color
-            # Of a sum: torch.autograd.grad imports sympy for the gradient of an image.
+            # The gradient of a sum, because torch.autograd.grad imports sympy for the gradient of an image.
             (gradient,) = torch.autograd.grad((drawn * image).sum(), harmonics)
         return gradient[:, 0] / SH_0

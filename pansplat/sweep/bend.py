@@ -23,18 +23,18 @@ _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the fi
 
 
 # Evidence
-_TOLERANCE = 0.03  # relative difference of depth of two views' surfaces that agree; evidence ends at twice of it
+_AGREEING_DEPTH = 0.03  # relative difference of depth up to which two surfaces agree; evidence ends at twice of it
 _MAX_DIFFERENCE = 0.12  # mean difference of colour of 5x5 pixels above which a match is no evidence
 _FULL_PARALLAX = 0.25  # angle between the two rays to a point from which a match has full weight, radians
 
 # Fields, from the smoothest to the finest
-_SMOOTHNESS = (1e5, 3e3, 300.0, 30.0, 3.0)  # coupling of neighbouring pixels, relative to full evidence
+_SMOOTHNESS = (1e5, 3e3, 300.0, 30.0, 3.0)  # coupling of neighbouring pixels, in full evidence (docs/what_was_tried.md)
 _STIFFNESS = (0.0, 0.01, 0.02, 0.04, 0.05)  # evidence at which a field has half of its amplitude
-_OUTLIER = (1.0, 0.6, 0.3, 0.15, 0.06)  # deviation from a field, in log-depth, that halves the weight of a match
+_OUTLIER = (1.0, 0.6, 0.3, 0.15, 0.06)  # deviation in log-depth that halves the weight of a match; halls need the first
 _ITERATIONS = 2  # weightings of the matches by their deviation, for each field
 # Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence for
 # the field, above a difference that is no discontinuity.
-_DISCONTINUITY, _SLOPE = 0.06, 0.02
+_DISCONTINUITY, _EVIDENCE_SLOPE = 0.06, 0.02
 
 
 def bend_surfaces(
@@ -77,7 +77,7 @@ def measure_evidence(
         distance = np.linalg.norm(local, axis=-1)
         pixel = nearest_pixel(local, surface.height)
         deviation = np.abs(np.log(np.maximum(distance * surfaces[other].inverse_depth[pixel], 1e-6)))
-        weight = np.clip(2 - deviation / _TOLERANCE, 0, 1) * posed.masks[other][pixel]
+        weight = np.clip(2 - deviation / _AGREEING_DEPTH, 0, 1) * posed.masks[other][pixel]
         difference = np.abs(posed.images[other][pixel] - image).mean(axis=2)
         mean = cv2.boxFilter(pad_sphere(difference, 2), -1, (5, 5))[2:-2, 2:-2]
         weight *= mean < _MAX_DIFFERENCE
@@ -131,7 +131,7 @@ def _couple(target: np.ndarray, evidence: np.ndarray, log_depth: np.ndarray) -> 
     for lines in (maps, as_meridians(maps)):
         following = np.roll(lines, -1, axis=-1)
         jumps, field_jumps, _ = np.abs(following - lines)
-        field_jumps = np.maximum(field_jumps - _SLOPE, 0) * np.minimum(lines[2], following[2])
+        field_jumps = np.maximum(field_jumps - _EVIDENCE_SLOPE, 0) * np.minimum(lines[2], following[2])
         couplings.append(np.exp(-(jumps + field_jumps) / _DISCONTINUITY))
     rows, meridians = couplings
     return rows, meridians

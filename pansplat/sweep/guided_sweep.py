@@ -43,8 +43,8 @@ _KINDS: dict[type, tuple[str, type]] = {
     DepthRefinement: ("depth", RefinementConfig),
     DepthSharpening: ("depth_sharpening", SharpeningConfig),
 }
-_SECONDS = 1.0  # that the networks take for a panorama on two cores, about
-_SEARCH_HEIGHT = 384  # pixels; at 512 the search takes 1.6 times as long and is not better
+_PANORAMA_SECONDS = 1.0  # time that the networks take for a panorama on two cores
+_SEARCH_HEIGHT = 384  # rows; 512 take 1.6 times as long, 256 break stems of lamps (docs/what_was_tried.md)
 
 
 def load_guided_sweep(path: Path, name: str = "default", depth_network: Path | str | None = None) -> Sweep:
@@ -135,9 +135,9 @@ class NetworkPrior:
     @torch.no_grad()
     def observe(self, images: Sequence[np.ndarray]) -> NetworkObservation:
         """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
-        device = choose_device("depth networks", len(images) * _SECONDS)
+        device = choose_device("depth networks", len(images) * _PANORAMA_SECONDS)
         network, sharpening = self.network, self.sharpening
-        if device.type != "cpu":  # other threads use these networks, too
+        if device.type != "cpu":  # other threads use these networks, too, so they are copied
             network, sharpening = (copy.deepcopy(each).to(device) for each in (network, sharpening))
         maps = torch.stack([torch.from_numpy(image).permute(2, 0, 1) for image in images]).float()
         small = interpolate(maps, (self.height, 2 * self.height), mode="area")

@@ -19,19 +19,19 @@ from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equ
 from pansplat.networks.depth_network import DepthEstimate
 from pansplat.system.threads import one_thread
 
-_TANGENT = math.tan(math.radians(95) / 2)  # of half of the field of view along a crop's shorter side
+_HALF_FIELD_TANGENT = math.tan(math.radians(95) / 2)  # half of the 95 degrees along a crop's shorter side
 # Yaw and pitch of the crops, degrees; the last two look straight up and down.
 _ANGLES = [(60 * n, 0) for n in range(6)] + [(90 * n + 30, side) for side in (50, -50) for n in range(4)]
 _ANGLES += [(0, 90), (0, -90)]
 _AGREEMENT = 0.05  # deviation of log-depth that halves the weight of a crop in a pixel
-_TRUST = 0.05  # weight of the estimate, relative to a crop of equal certainty
+_ESTIMATE_WEIGHT = 0.05  # weight of the estimate, relative to a crop of equal certainty
 _DOMINANCE = 3  # exponent of the weights with which crops are blended
 _ITERATIONS = 30
-_MAX_STEP = 1.0  # of the logarithms of scale and shift in one iteration
-_DAMPING = 1e-4  # for crops that show one distance only, relative to their weight
+_MAX_STEP = 1.0  # largest change of the logarithm of a scale or a shift in one iteration
+_DAMPING = 1e-4  # relative to a crop's weight; crops that show one distance only need it
 _LEAST_CONTRAST = 1e-4  # mean difference of a crop's values from its smallest, relative to the largest
-_MAX_CORRELATION = 0.3  # of the crops' values with the estimated distance
-_FARTHEST = 2.0  # joined depth, relative to the largest of the estimate
+_MAX_CORRELATION = 0.3  # largest correlation of a crop's values with the estimated distance
+_MAX_DEPTH_RATIO = 2.0  # largest joined depth over the largest depth of the estimate
 
 
 def crop_panorama(
@@ -70,7 +70,7 @@ def join_crops(
         window = window**_DOMINANCE
         total += window * _log_depth(_sample(crop, position), forward, solved)
         weight += window
-    return (total / weight).clamp_max(float(estimate.log_depth.max()) + math.log(_FARTHEST))
+    return (total / weight).clamp_max(float(estimate.log_depth.max()) + math.log(_MAX_DEPTH_RATIO))
 
 
 def solve_crops(crops: Sequence[Float[Tensor, "h w"]], estimate: DepthEstimate) -> Float[Tensor, "crop 2"]:
@@ -95,7 +95,7 @@ def solve_crops(crops: Sequence[Float[Tensor, "h w"]], estimate: DepthEstimate) 
             "with the distance; choose a network of inverse depth (docs/depth_network.md)."
         )
     window = window * area / _AGREEMENT**2
-    certainty = _TRUST * area / scale**2
+    certainty = _ESTIMATE_WEIGHT * area / scale**2
     solved = torch.zeros(len(crops), 2, dtype=torch.float64)
     mean = known
     for _ in range(_ITERATIONS):
@@ -136,7 +136,7 @@ def _normalise(crop: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 def _extent(size: Sequence[int]) -> tuple[float, float]:
     """Tangents of half of the field of view, along width and height, of a crop of a size (height, width)."""
-    return _TANGENT * size[1] / min(size), _TANGENT * size[0] / min(size)
+    return _HALF_FIELD_TANGENT * size[1] / min(size), _HALF_FIELD_TANGENT * size[0] / min(size)
 
 
 def _project(axes: Tensor, size: Sequence[int], height: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -160,7 +160,7 @@ def _sample_crops(crops: Sequence[Tensor], height: int) -> tuple[Tensor, Tensor,
     found = []
     for crop, axes in zip(crops, crop_axes(), strict=True):
         position, forward, window = _project(axes, crop.shape, height)
-        factor = 2 * _TANGENT * height / math.pi / min(crop.shape)
+        factor = 2 * _HALF_FIELD_TANGENT * height / math.pi / min(crop.shape)
         small = crop if factor > 1 else interpolate(crop[None, None].double(), scale_factor=factor, mode="area")[0, 0]
         found.append(torch.stack([each.flatten() for each in (_sample(small, position), forward, window)]))
     values, forward, window = torch.stack(found, dim=1)

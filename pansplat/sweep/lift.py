@@ -58,21 +58,21 @@ _FINE_FOOTPRINT = 0.6  # the same on lattices finer than the surface
 _THICKNESS = 0.1  # standard deviation across the surface, relative to the disc's
 _MAX_STRETCH = (4.0, 4.0, 12.0, 24.0)  # largest ratio of a disc's long axis to its short one, by level
 _BACKGROUND_DEPTH = (1.02, 1.04)  # depth of levels 2 and 3 relative to the background
-_BACKGROUND_REACH = (4, 8)  # by which the background is extended in front of a discontinuity, pixels of the level
+_BACKGROUND_REACH = (4, 8)  # pixels of the level by which the background is extended in front of a discontinuity
 
 # Levels
-_SURFACE_HEIGHT = 512  # of panoramas of twice this height or more: surfaces of a half, a quarter ..., not below this
-_DETAIL = 0.02  # largest colour error of level 1
-_FINE_DETAIL = 0.015  # largest colour error of a lattice where no finer one replaces it
-_FINE_POINTS = 780_000  # of a view on the finer lattices, at most: a larger error is allowed where they do not suffice
+_SURFACE_HEIGHT = 512  # taller panoramas have surfaces of a half, a quarter ... of their height, not below this
+_MAX_COLOR_ERROR = 0.02  # largest error of a colour that level 1 draws
+_FINE_COLOR_ERROR = 0.015  # largest colour error of a lattice where no finer one replaces it
+_FINE_POINTS = 780_000  # points of a view on the finer lattices; where they do not suffice, a larger error is allowed
 _DISCONTINUITY = 0.15  # relative change of inverse depth between pixels at a discontinuity
 
 # Relative difference of depth up to which another view confirms a point, and beyond which it may remove it: more than
 # in `consistency_mask`, which chooses the pixels that may remove points.
-_TOLERANCE = 0.15
-_CONSISTENT_OPACITY = 0.95  # where another view is consistent
-_SINGLE_VIEW_OPACITY = 0.9  # where no other view sees the surface
-_UNCERTAIN_OPACITY = 0.8  # in the free space of another view whose own surface is not consistent with any view
+_DEPTH_TOLERANCE = 0.15
+_CONSISTENT_OPACITY = 0.95  # opacity where another view is consistent
+_SINGLE_VIEW_OPACITY = 0.9  # opacity where no other view sees the surface
+_UNCERTAIN_OPACITY = 0.8  # opacity in the free space of another view whose own surface is not consistent with any view
 
 
 def lift(posed: PosedImages, surfaces: list[Surface], neighbours: Sequence[Sequence[int]]) -> Gaussians:
@@ -141,7 +141,7 @@ def _choose_fine_pixels(image: np.ndarray, heights: list[int]) -> list[np.ndarra
     for height, coarser in itertools.pairwise(heights):
         detail = resize_sphere(image, height)
         errors.append(np.abs(detail - resize_sphere(resize_sphere(detail, coarser), height)).max(axis=2))
-    limit = _FINE_DETAIL
+    limit = _FINE_COLOR_ERROR
     while True:
         masks, count = [], 0.0
         finer = np.zeros((heights[0], 2 * heights[0]), bool)
@@ -239,7 +239,7 @@ def _sample_bilinear(padded, rays, samples, first, end):
     height = len(padded) - 2
     for n in range(first, end):
         x, y = locate(rays[n, 0], rays[n, 1], rays[n, 2], height)
-        column, row = min(int(x + 0.5), 2 * height), min(int(y + 0.5), height)  # of the padded image
+        column, row = min(int(x + 0.5), 2 * height), min(int(y + 0.5), height)  # pixel of the padded image
         right, lower = x + 0.5 - column, y + 0.5 - row
         for c in range(samples.shape[1]):
             above = padded[row, column, c] * (1 - right) + padded[row, column + 1, c] * right
@@ -261,7 +261,7 @@ def _choose_levels(image: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     coarse = resize_sphere(resize_sphere(image, height // 2), height)
     error = np.abs(image - coarse).max(axis=2)
     near, far = _window_extremum(inverse, 1, largest=True), _window_extremum(inverse, 1, largest=False)
-    fine = (error > _DETAIL) | (near > far * (1 + _DISCONTINUITY))
+    fine = (error > _MAX_COLOR_ERROR) | (near > far * (1 + _DISCONTINUITY))
     return np.where(_window_extremum(fine.astype(np.uint8), 2, largest=True) > 0, 0, 1)
 
 
@@ -306,7 +306,7 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
         certain = scene.consistent[other] & posed.masks[other]
         pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
         inverse = scene.surfaces[other].inverse_depth
-        limits = _TOLERANCE, _MIN_DISTANCE * posed.near
+        limits = _DEPTH_TOLERANCE, _MIN_DISTANCE * posed.near
         for_point_ranges(partial(_count_judgements, points, inverse, certain, pose, *limits, counts), len(points))
     confirmed, contradicted, doubtful, near = counts
     opacity = np.where(doubtful > 0, np.float32(_UNCERTAIN_OPACITY), np.float32(_SINGLE_VIEW_OPACITY))

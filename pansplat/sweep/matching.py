@@ -32,7 +32,7 @@ from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_cou
 from pansplat.sweep.surface import pad_sphere, ray_grid
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
-_BLOCK = 8  # hypotheses that a thread processes together
+_BATCH = 8  # hypotheses that a thread processes together
 
 
 @dataclass(frozen=True)
@@ -310,15 +310,15 @@ def _compute_block_cost(view, other, hypotheses, limits, weights, cost, total, o
 
     Without `total`, there is one other view: its costs are written. The set starts at `offset`.
     """
-    first = block * _BLOCK
-    last = min(first + _BLOCK, len(hypotheses.penalty))
+    first = block * _BATCH
+    last = min(first + _BATCH, len(hypotheses.penalty))
     height, width = view.mean.shape
     m = (view.gray.shape[0] - height) // 2
     maps, row = np.empty((6, height, width), np.float32), np.empty((5, width), np.float32)
     gray, state = np.empty((height + 2 * m, width + 2 * m), np.float32), np.empty((height, width), np.uint8)
     warped, sums = _Warped(gray, maps[0], state, maps[1], maps[2]), (maps[3], maps[4], maps[5])
     column = np.empty((3, width + 2 * m), np.float32)
-    result, share = np.empty((height, width, _BLOCK), np.float32), np.empty((height, width, _BLOCK), np.float32)
+    result, share = np.empty((height, width, _BATCH), np.float32), np.empty((height, width, _BATCH), np.float32)
     for k in range(first, last):
         _warp(k, view, other, hypotheses, limits, weights, row, warped)
         _pad_in_place(warped.gray, m)
@@ -458,7 +458,7 @@ def compute_matching_cost(
             hypotheses = _Set(*maps, side, back_facing)
             own_weights = weights if own.sphere else weights._replace(opposed_penalty=np.float32(0))
             arguments = matched, warped, hypotheses, (low, high), own_weights, cost, total, n * count
-            parallel_for(partial(_compute_block_cost, *arguments), -(-count // _BLOCK), thread_count())
+            parallel_for(partial(_compute_block_cost, *arguments), -(-count // _BATCH), thread_count())
     if several:
         cost /= total
     return cost
@@ -611,7 +611,7 @@ def aggregate_costs(cost: np.ndarray, guide: np.ndarray, slot_map: np.ndarray, s
                 _aggregate_columns(cost, total, guide, slot_map, slots, _PENALTIES, dy, dx, height // 4)
         return total
 
-    groups = (_DIRECTIONS[::2], _DIRECTIONS[1::2])  # of equal cost, a thread each
+    groups = (_DIRECTIONS[::2], _DIRECTIONS[1::2])  # the two groups cost the same; each has a thread
     with ThreadPoolExecutor(len(groups)) as pool:
         first, second = pool.map(run, groups)
     first += second

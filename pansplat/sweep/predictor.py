@@ -24,7 +24,7 @@ from pansplat.sweep.surface import PosedImages
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 
-_MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
+_HEIGHT_MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 
 
 class Sweep:
@@ -85,7 +85,7 @@ class Sweep:
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
         _check_inputs(images, cam2world, low, high, masks)
-        images, masks = fit_panoramas(images, masks, _MULTIPLE)
+        images, masks = fit_panoramas(images, masks, _HEIGHT_MULTIPLE)
         # Holes of scans are not matched, but fitted, so that Gaussians beside a hole do not reach into it; in a single
         # view, whose background layer continues there, they are not.
         given = torch.ones(images[:, 0].shape, dtype=torch.bool) if masks is None else masks.cpu()
@@ -98,7 +98,7 @@ class Sweep:
             near=low,
             far=high,
         )
-        with stage(0.57):  # of the time, as are all fractions here (the sample on two cores)
+        with stage(0.57):  # fractions of the whole time, measured with the sample on two cores
             # Axes of the scene, planes, and of each view its neighbours and the depth that the prior model expects.
             scene = observe(posed, self.config, self.prior)
             # Inverse depth (h, 2h) of each view, at most `SearchConfig.finest_height` high.

@@ -33,19 +33,19 @@ from pansplat.sweep.surface import (
 )
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
-_MAX_VARIANCE = 4e-3  # of grey values; more texture has no more weight
+_MAX_VARIANCE = 4e-3  # largest variance of grey values that raises a weight; more texture has no more
 _SHARP_SCALE = 0.08  # Laplace scale up to which a pixel has full weight in the search of the height
 _MAX_COST = 1.2  # matching cost above which a pixel does not count against a height
 _HEIGHT_PENALTY = 0.06  # matching cost of a height by a factor of e from the usual one
-_FLOOR_TOLERANCE = 0.15  # in camera heights, from the floor to the pixels that the model places on it
+_FLOOR_TOLERANCE = 0.15  # distance from the floor of pixels that the model places on it, in camera heights
 _SAME_HEIGHT = 0.02  # relative difference of two heights whose priors are the same
-_MIN_SPREAD = 0.1  # relative deviation of an estimate, at least, when it decides what a view sees
-_MIN_OVERLAP = 0.5  # of views that are matched
-_ITERATIONS = 2  # refinements by comparison of the views
+_MIN_SPREAD = 0.1  # least relative deviation of an estimate that decides what a view sees
+_MIN_OVERLAP = 0.5  # least common fraction of the surfaces of views that are matched (docs/what_was_tried.md)
+_REFINEMENTS = 2  # refinements of the depth by comparison of the views
 
 # The cost of a prior, in the unit of the matching cost
-_WEIGHT = 0.25  # cost of a deviation by one Laplace scale
-_CAP = 3.0  # deviation, in Laplace scales, above which the cost is constant
+_DEVIATION_COST = 0.25  # matching cost of a deviation by one Laplace scale
+_MAX_DEVIATION = 3.0  # deviation, in Laplace scales, above which the cost is constant
 _MIN_SCALE = 0.03  # smallest Laplace scale of log-depth
 _FURTHER_PENALTY = 0.25  # added to the deviation from each prior but the first, in Laplace scales
 
@@ -182,7 +182,7 @@ class PriorEstimator:
             neighbours: the other views that each view is compared with.
         """
         first = self._turn_back(self._observed.priors)
-        by_pair = {}  # by the best neighbour: the model errs by another factor in each room
+        by_pair = {}  # grouped by the best neighbour: the model errs by another factor in each room
         pairs = list_best_pairs(neighbours)
         for nodes in set(pairs):
             pair = [[maps[n] for n in nodes] for maps in (first, views)]
@@ -197,7 +197,7 @@ class PriorEstimator:
             heights.pop()
         starts = [_scale_depth(self._observed.priors, own) for own in heights]
         poses = self._upright_poses
-        refined = [self._turn_back(self._observed.refine(each, poses, neighbours, _ITERATIONS)) for each in starts]
+        refined = [self._turn_back(self._observed.refine(each, poses, neighbours, _REFINEMENTS)) for each in starts]
         return [list(own) for own in zip(*refined, strict=True)]
 
     def _turn_back(self, priors: Sequence[DepthPrior]) -> list[DepthPrior]:
@@ -224,7 +224,7 @@ def _estimate_camera_heights(
     Args:
         floor_only: whether only the pixels count that the priors place on the floor.
     """
-    above = -(cam2world[:, :3, 3] @ down)  # of each camera, over any level
+    above = -(cam2world[:, :3, 3] @ down)  # height of each camera over any level
     above -= above.mean()
     priors = [prior.resize(len(view.image)) for prior, view in zip(priors, views, strict=True)]
     weights = [_weight_pixels(*pair) for pair in zip(priors, views, strict=True)]
@@ -234,11 +234,11 @@ def _estimate_camera_heights(
             weight *= np.abs(below - 1) < _FLOOR_TOLERANCE
     unit = (len(views) - 1) * max(sum(float(weight.sum()) for weight in weights), 1e-9)
     low, high = limits
-    for penalty in (_HEIGHT_PENALTY, 0.01 * _HEIGHT_PENALTY):  # all heights, then the ones around the best
-        candidates = np.linspace(low, high, _HEIGHT_CANDIDATES)  # inverse heights
+    for penalty in (_HEIGHT_PENALTY, 0.01 * _HEIGHT_PENALTY):  # the second round only takes the heights around the best
+        candidates = np.linspace(low, high, _HEIGHT_CANDIDATES)  # inverse heights of the cameras' mean
         total = unit * penalty * np.abs(np.log(CAMERA_HEIGHT * candidates))
         for n, prior in enumerate(priors):
-            own = 1 / np.maximum(1 / candidates + above[n], 1 / limits[1])  # this camera's, by the mean's
+            own = 1 / np.maximum(1 / candidates + above[n], 1 / limits[1])  # inverse height of this camera
             sampled = np.linspace(own[0], max(own[-1], own[0] + 1e-6), _HEIGHT_CANDIDATES)
             costs = _match_heights(prior, weights[n], n, views, cam2world, sampled)
             total += np.interp(own, sampled, costs)
@@ -304,7 +304,7 @@ def apply_prior_cost(cost: np.ndarray, priors: Sequence[DepthPrior], sets: Seque
     log_depth = np.stack([prior.log_depth for prior in priors]).astype(np.float32)
     scale = np.stack([np.maximum(prior.scale, _MIN_SCALE) for prior in priors]).astype(np.float32)
     penalty = np.where(np.arange(len(priors)) > 0, _FURTHER_PENALTY, 0).astype(np.float32)
-    weight, cap = np.float32(_WEIGHT), np.float32(_CAP)
+    weight, cap = np.float32(_DEVIATION_COST), np.float32(_MAX_DEVIATION)
     for n, hypotheses in enumerate(sets):
         base, step = (np.ascontiguousarray(each, np.float32) for each in (hypotheses.base, hypotheses.step))
         add = partial(_add_cost, cost, log_depth, scale, penalty, base, step, n * count, count, weight, cap)

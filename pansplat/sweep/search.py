@@ -50,19 +50,19 @@ from pansplat.sweep.surface import (
 from pansplat.sweep.whole import make_whole
 from pansplat.system.progress import report_progress
 
-_STEP = 0.6  # metres that a camera moves from a view alone
-_SMALL_HEIGHT = 96  # pixels, of the panoramas in which heights of the cameras over the floor are compared
+_LONE_STEP = 0.6  # metres by which a camera leaves a view that has no neighbours
+_SMALL_HEIGHT = 96  # rows of the panoramas with which heights of the cameras over the floor are compared
 
 
 _MAX_CANDIDATES = 256  # largest number of hypotheses of a set at the coarse level
-_NEAR_MARGIN = 0.75  # the smallest depth of the search, relative to `near`
-_FAR_MARGIN = 10.0  # the largest one, relative to `far`: rooms are often larger than the range that was given
-_NARROW_CANDIDATES = (16, 8)  # hypotheses of a set at the two finer levels
-_MAX_NEIGHBOURS = 3  # other views, at most, that a view is matched against
+_NEAR_MARGIN = 0.75  # smallest searched depth, relative to `near`
+_FAR_MARGIN = 10.0  # largest searched depth, relative to `far`: rooms are often larger (docs/adr/0011)
+_NARROW_CANDIDATES = (16, 8)  # hypotheses of a set at the two finer levels (docs/what_was_tried.md)
+_MAX_NEIGHBOURS = 3  # other views that a view is matched against
 
-# Of a search near the surfaces of single views, by level: hypotheses, and the largest relative change of inverse depth
+# A search near the surfaces of single views: hypotheses by level, and largest relative change of inverse depth by level
 _SINGLE_VIEW_CANDIDATES, _SINGLE_VIEW_REACH = (33, 25, 17), (0.4, 0.2, 0.1)
-_SINGLE_VIEW_PENALTY = 0.03  # of the largest change: walls without texture keep their place
+_SINGLE_VIEW_PENALTY = 0.03  # matching cost of the largest change, which keeps walls without texture in place
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def observe(
     if estimator is not None:
         neighbours = estimator.choose_neighbours(_MAX_NEIGHBOURS)
 
-    by_pair = {}  # with the best neighbour: poses of further rooms may have another gravity
+    by_pair = {}  # grouped by the best neighbour: poses of further rooms may have another gravity
     pairs = list_best_pairs(neighbours)
     for pair in set(pairs) if len(posed.images) > 2 else ():
         turned = estimate_axes([small[n] for n in pair], posed.cam2world[list(pair), :3, :3])
@@ -148,7 +148,7 @@ def search(scene: ObservedScene) -> list[Surface]:
     distances = measure_distances(posed.cam2world)
     baselines = [distances[view, others[0]] if others else 0.0 for view, others in enumerate(scene.neighbours)]
     return [
-        Surface(make_whole(surface.inverse_depth, image, max(baseline, _STEP)).clip(*scene.depths.limits))
+        Surface(make_whole(surface.inverse_depth, image, max(baseline, _LONE_STEP)).clip(*scene.depths.limits))
         for surface, image, baseline in zip(surfaces, posed.images, baselines, strict=True)
     ]
 
@@ -160,7 +160,7 @@ def _search(scene: ObservedScene, finest_posed: PosedImages) -> list[Surface]:
     heights = [max(finest // 4, 16), max(finest // 2, 16), finest]
     if config.near_single_views:
         return _search_near_single_views(scene, heights)
-    pixel = math.pi / heights[0] / (depths.high - depths.low)  # candidates are a pixel of parallax apart
+    pixel = math.pi / heights[0] / (depths.high - depths.low)  # neighbouring candidates are a pixel of parallax apart
     baselines = [posed.measure_baseline([view, *others]) for view, others in enumerate(neighbours)]
     counts = [int(np.clip(math.ceil(baseline / pixel), 48, _MAX_CANDIDATES)) for baseline in baselines]
     report_progress("searching the whole depth range", 0.25)
@@ -209,7 +209,7 @@ def _search_near_single_views(scene: ObservedScene, heights: Sequence[int]) -> l
 
 def choose_nearest(cam2world: np.ndarray, count: int, least: float) -> list[list[int]]:
     """The other views of each view, the nearest cameras first, at most `count`; those within `least` metres last."""
-    distances = measure_distances(cam2world).round(6)  # of a grid they are equal but for rounding
+    distances = measure_distances(cam2world).round(6)  # rounded: in a grid, equal distances differ in their last digits
     distances[distances < least] += distances.max()
     np.fill_diagonal(distances, -1)
     return distances.argsort(axis=1, kind="stable")[:, 1 : count + 1].tolist()

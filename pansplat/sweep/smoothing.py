@@ -13,7 +13,7 @@ import numpy as np
 from pansplat.geometry.equirect import row_weights
 from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_count
 
-_PASSES = 2  # over rows and meridians
+_PASSES = 2  # solutions over all rows, then over all meridians
 _MAX_ROW_COUPLING = 1e3  # largest factor of the couplings of a row, whose pixels are close to each other at the poles
 
 

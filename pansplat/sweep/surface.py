@@ -19,9 +19,9 @@ from pansplat.rendering.cpu.runtime import cached_njit, parallel_for, thread_cou
 
 CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
 _RANGE = 1 << 14  # points that a thread processes together
-_MIN_TILT = math.radians(0.5)  # of a camera that is turned upright
-_SMOOTH = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
-_CONSISTENCY = 0.06  # largest relative difference of depth of two views' surfaces that are consistent
+_MIN_TILT = math.radians(0.5)  # a camera with less tilt is not turned upright
+_MAX_SMOOTH_CHANGE = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
+_MAX_INCONSISTENCY = 0.06  # largest relative difference of depth of two views' surfaces that are consistent
 
 
 @functools.lru_cache(maxsize=4)
@@ -110,7 +110,7 @@ def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | Non
     angle = math.atan2(sine, cosine)
     if angle < _MIN_TILT:
         return None
-    if sine < 1e-9:  # upside down
+    if sine < 1e-9:  # the camera is upside down
         return np.diag((1.0, -1.0, -1.0))
     return cv2.Rodrigues(axis / sine * angle)[0]
 
@@ -210,7 +210,7 @@ def consistency_mask(
     points = world_points(surfaces[view], cam2world[view])
     consistent = np.zeros(points.shape[:2], bool)
     for other in others:
-        consistent |= classify_visibility(points, surfaces[other], cam2world[other], _CONSISTENCY) == CONSISTENT
+        consistent |= classify_visibility(points, surfaces[other], cam2world[other], _MAX_INCONSISTENCY) == CONSISTENT
     return consistent
 
 
@@ -232,7 +232,7 @@ def guided_upsample(
     # Columns wrap; the rows beyond a pole, where the filters have no values, do not count.
     wrapped = np.concatenate((inverse[:, -2:], inverse, inverse[:, :2]), axis=1)
     lowest, highest = cv2.erode(wrapped, window)[:, 2:-2], cv2.dilate(wrapped, window)[:, 2:-2]
-    smooth = highest < (1 + _SMOOTH) * lowest
+    smooth = highest < (1 + _MAX_SMOOTH_CHANGE) * lowest
     result = np.zeros(needed.shape, np.float32)
     work = partial(_upsample, inverse, smooth, coarse, fine, needed, result)
     parallel_for(work, len(needed), thread_count())
@@ -282,5 +282,5 @@ def _upsample(inverse, is_smooth, coarse, fine, needed, result, i):
         while below < 0.5 * total and median < 24:
             median += 1
             below += weights[median]
-        close = abs(smooth / values[median] - 1) < _SMOOTH
+        close = abs(smooth / values[median] - 1) < _MAX_SMOOTH_CHANGE
         result[i, j] = smooth if close else values[median]

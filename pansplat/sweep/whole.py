@@ -24,18 +24,18 @@ from pansplat.sweep.smoothing import as_meridians, smooth_sphere
 from pansplat.sweep.surface import nearest_pixel
 
 # Angles are in radians.
-_ANGLE = math.radians(1.5)  # standard deviation of the average where the distance is the baseline
+_BASELINE_ANGLE = math.radians(1.5)  # deviation of the average where depth is the baseline (docs/what_was_tried.md)
 _MAX_ANGLE = math.radians(4)
-_CROP = 0.5  # height of the crops in which segments are found, relative to the panorama's
-_CONTRAST = 20, 60  # thresholds of Canny's edges, of grey values up to 255
-_OFF_LINE = 1.414  # pixels of an edge off its segment, at most
+_CROP_SHARE = 0.5  # height of the crops in which segments are found, relative to the panorama's
+_CONTRAST = 20, 60  # grey values up to 255; thresholds of Canny's edge detector
+_MAX_LINE_ERROR = 1.414  # pixels between an edge and its segment
 _MIN_LENGTH = math.radians(5)
 _FULL_WEIGHT = math.radians(10)  # length of a segment of weight 1
 _OUTLIER = 0.1  # deviation of log-depth from a segment's fit that halves a weight
-_FIELD = math.radians(1.5)  # standard deviation of the smooth factor beside a segment
-_STIFFNESS = 0.05  # weight of no change
-_ITERATIONS = 3  # of fits and factors
-_FIT_ITERATIONS = 3  # weightings in a fit
+_FIELD_ANGLE = math.radians(1.5)  # standard deviation of the smooth factor beside a segment
+_STIFFNESS = 0.05  # weight of a factor of 1, that is, of no change
+_ITERATIONS = 3  # rounds of fits of the segments, each followed by their factors
+_FIT_ITERATIONS = 3  # reweightings within a fit
 
 
 def make_whole(
@@ -46,11 +46,11 @@ def make_whole(
     Args:
         baseline: distance of the cameras between which one flies, in the unit of depth.
     """
-    angle = np.minimum(_ANGLE * baseline * inverse_depth.astype(np.float64), _MAX_ANGLE)
+    angle = np.minimum(_BASELINE_ANGLE * baseline * inverse_depth.astype(np.float64), _MAX_ANGLE)
     whole = _average(np.stack((inverse_depth, np.ones_like(inverse_depth))), angle)[0]
     segments = find_segments(image)
     pixels, number, angles, weight = _sample_segments(segments, len(image))
-    field_angle = np.full_like(angle, _FIELD)
+    field_angle = np.full_like(angle, _FIELD_ANGLE)
     for _ in range(_ITERATIONS if len(segments) else 0):
         change, certainty = _fit_segments(whole[pixels], number, angles)
         sums = np.zeros((2, *angle.shape))
@@ -63,11 +63,11 @@ def make_whole(
 
 def find_segments(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "segment 2 3"]:
     """Unit directions of both ends of the straight segments of a photograph; crops that overlap repeat some."""
-    size = max(round(_CROP * len(image)), 8)
+    size = max(round(_CROP_SHARE * len(image)), 8)
     gray = torch.from_numpy(np.ascontiguousarray(image)).mean(dim=2)[None].clamp(0, 1)
     crops = (crop_panorama(gray, (size, size))[:, 0] * 255).round().byte().numpy()
     shortest = max(round(_MIN_LENGTH * len(image) / math.pi), 6)
-    detector = cv2.ximgproc.createFastLineDetector(shortest, _OFF_LINE, *_CONTRAST, 3, True)
+    detector = cv2.ximgproc.createFastLineDetector(shortest, _MAX_LINE_ERROR, *_CONTRAST, 3, True)
     found = [np.zeros((0, 2, 3))]
     for crop, axes in zip(crops, crop_axes().numpy(), strict=True):
         ends = detector.detect(crop)

@@ -37,11 +37,11 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
 _COLORS = {"error": 31, "interrupted": 31, "note": 33, "progress": 36}  # ANSI codes of red, yellow and cyan
-_COMPLETION, _ALL = "--tyro-print-completion", "--help-all"
-_LINE_INTERVAL, _MAX_LEFT = 30.0, 86_400.0  # seconds: between two lines of progress; whole time that is stated
-_AGREE = 1.5  # between two estimates of the whole time of some work
-_LONG_HELP = 60  # lines
-_MIN_WIDTH = 40  # columns of help; tyro's layout of narrow ones does not end
+_COMPLETION, _ALL_OPTIONS = "--tyro-print-completion", "--help-all"
+_LINE_INTERVAL, _MAX_WHOLE = 30.0, 86_400.0  # seconds: between two lines; of the longest whole time stated
+_MAX_RATIO = 1.5  # largest ratio of two estimates of a task's whole time, for the time left to be stated
+_LONG_HELP = 60  # lines of a help text above which further options are listed by name only
+_MIN_WIDTH = 40  # columns; in narrower terminals tyro's layout of help texts does not end
 _REDRAW_INTERVAL = 0.25  # seconds between two states of a progress bar in a notebook
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -72,7 +72,7 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         try:
             try:
                 status = command()
-            except SystemExit as request:  # of the parser of arguments
+            except SystemExit as request:  # the parser of arguments ends in this way
                 status = request
             sys.stdout.flush()
         except BaseException as error:
@@ -107,9 +107,9 @@ def _report(error: BaseException, memory_advice: str) -> int:
 
 def _report_system_error(error: OSError) -> int:
     """Print one line about an error of the operating system, unless standard output was closed by its reader."""
-    if error.filename is None:  # of standard output, whose unwritten text would fail again at the end
+    if error.filename is None:  # an error of standard output, whose unwritten text would fail again at the end
         _discard_output(sys.stdout)
-        closed = errno.EINVAL if sys.platform == "win32" else errno.EPIPE  # of a pipe that its reader closed
+        closed = errno.EINVAL if sys.platform == "win32" else errno.EPIPE  # the reader of a pipe closed it
         if error.errno == closed:
             return CLOSED_PIPE
     name, reason = error.filename or "standard output", error.strerror or str(error) or type(error).__name__
@@ -244,7 +244,7 @@ def parse_arguments(parse: Callable[[Sequence[str]], _T], program: str, argument
         os.environ["COLUMNS"] = str(_MIN_WIDTH)
     try:
         with NUMBERS, contextlib.redirect_stdout(printed if is_script or is_short else sys.stdout):
-            return parse(["--help" if argument == _ALL else argument for argument in given])
+            return parse(["--help" if argument == _ALL_OPTIONS else argument for argument in given])
     finally:
         os.environ.pop("COLUMNS", None)
         os.environ |= {} if width is None else {"COLUMNS": width}
@@ -266,7 +266,7 @@ def _shorten_help(text: str) -> str:
             shown += first + "".join(sorted(entries[:-1], key=lambda entry: "(required)" not in entry) + entries[-1:])
         else:
             names += " ".join((f"  {group[1]}:", *re.findall(r"(?m)^(?:│ |  )(--?\w[\w.-]*)", block))) + "\n"
-    return f"{shown}More options; {_ALL} describes them:\n{names}" if names else shown
+    return f"{shown}More options; {_ALL_OPTIONS} describes them:\n{names}" if names else shown
 
 
 def is_notebook() -> bool:
@@ -313,7 +313,7 @@ def progress_bar() -> Iterator[None]:
         def show(step: str, fraction: float) -> None:
             time_left.report(fraction)
             bar.update(task, description=step, completed=fraction)
-            if callable(redraw):  # in a notebook
+            if callable(redraw):
                 redraw()
 
         with show_progress(show):
@@ -323,14 +323,14 @@ def progress_bar() -> Iterator[None]:
 class _TimeLeft:
     """The time that work will still take, from the fractions done.
 
-    The rate so far and that of the last half of the time must agree on the whole time within a factor of `_AGREE`;
-    the longer time is stated. It never exceeds `_AGREE` times a whole time that was stated before: nothing is then.
+    The rate so far and that of the last half of the time must agree on the whole time within a factor of `_MAX_RATIO`;
+    the longer time is stated. It never exceeds `_MAX_RATIO` times a whole time that was stated before: nothing is then.
     """
 
     def __init__(self) -> None:
         """The work begins."""
         self._times, self._fractions = [time.monotonic()], [0.0]
-        self._least = math.inf  # whole time that was stated, seconds
+        self._shortest = math.inf  # shortest whole time that was stated, seconds
 
     def report(self, fraction: float) -> None:
         """Note the fraction that is done now."""
@@ -346,9 +346,9 @@ class _TimeLeft:
             return ""
         wholes = [now - began + (1 - done) / rate for rate in rates]
         whole = max(wholes)
-        if whole > _AGREE * min(*wholes, self._least) or whole > _MAX_LEFT:
+        if whole > _MAX_RATIO * min(*wholes, self._shortest) or whole > _MAX_WHOLE:
             return ""
-        self._least = min(self._least, whole)
+        self._shortest = min(self._shortest, whole)
         return f"about {whole - (now - began):.0f} s left"
 
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 Device = Literal["auto", "cpu", "cuda"]
-_MIN_TRITON = 3, 2  # the kernels join tuples, which earlier versions do not compile
-_MIN_CAPABILITY = 8, 0  # of a card, for which a test compiles the kernels
-_MIN_SECONDS = 5.0  # of work that `auto` gives to a card: CUDA and Triton's kernels take seconds to start
+_MIN_TRITON = 3, 2  # Triton's versions below this one do not compile the kernels, which join tuples
+_MIN_CAPABILITY = 8, 0  # least compute capability of a card; a test compiles the kernels for it
+_MIN_SECONDS = 5.0  # shortest work that `auto` gives to a card: CUDA and Triton's kernels take seconds to start
 
 _Say = Callable[[str], None]
 _current: ContextVar[tuple[Device, _Say | None]] = ContextVar("device", default=("auto", None))

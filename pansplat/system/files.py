@@ -17,13 +17,13 @@ SCENE_SUFFIXES = (".compressed.ply", ".spz", ".splat", ".sog", ".glb", ".ply")
 
 SOFTWARE = "software: pansplat"  # comment in every written file whose format has a place for one
 
-# The forms that the comment takes: in pictures, JSON and pages; in scene files; of an entry of a zip; in weights.
+# The forms of SOFTWARE: in pictures, JSON and pages; in scene files; in an entry of a zip; in files of weights.
 _WRITTEN = re.compile(
     rb'(software|generator)\W{1,5}(content\W{1,3})?pansplat|pansplat \{"version"|PK\x01\x02.{42}pansplat\.json'
     rb'|"pansplat_format"',
     re.IGNORECASE | re.DOTALL,
 )
-_REACH = 1 << 16  # bytes at the start and end of a file where the comment is
+_SEARCHED_BYTES = 1 << 16  # the start and the end of a file, where SOFTWARE is searched for
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -34,7 +34,7 @@ _KINDS = (
 )
 
 
-# Names of devices on Windows, with any suffix.
+# Windows opens a device for these names, whatever their suffix.
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d) *(\..*)?", re.IGNORECASE)
 
 
@@ -186,8 +186,8 @@ def is_written(path: Path) -> bool:
     """Whether pansplat wrote a file: it is named as the software in the first or last 64 KiB."""
     try:
         with open(path, "rb") as file:
-            head = file.read(_REACH)
-            file.seek(max(os.fstat(file.fileno()).st_size - _REACH, len(head)))
+            head = file.read(_SEARCHED_BYTES)
+            file.seek(max(os.fstat(file.fileno()).st_size - _SEARCHED_BYTES, len(head)))
             return _WRITTEN.search(head) is not None or _WRITTEN.search(file.read()) is not None
     except OSError:
         return False

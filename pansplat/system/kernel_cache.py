@@ -30,7 +30,7 @@ def choose_kernel_cache(package: str, environment: MutableMapping[str, str]) -> 
 
 def _can_make(folder: str) -> bool:
     """Whether a folder is writable or can be made."""
-    while not os.path.lexists(folder) and folder != os.path.dirname(folder):  # a drive may be missing
+    while not os.path.lexists(folder) and folder != os.path.dirname(folder):  # a whole drive may be missing
         folder = os.path.dirname(folder)
     return os.path.isdir(folder) and os.access(folder, os.W_OK | os.X_OK) and not _is_read_only(folder)
 

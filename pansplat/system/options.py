@@ -17,8 +17,8 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from pansplat.system.strict_json import convert
 
 CAMERA_HEIGHT = 1.5  # metres over the floor, if it is not known; tripods of tours stand at 1.3 to 1.6 m
-EYE_DISTANCE = 0.063  # metres, the mean of adults
-MIN_HEIGHT, MAX_HEIGHT = 64, 8192  # pixels, of panoramas that are predicted from
+EYE_DISTANCE = 0.063  # metres between the eyes, the mean of adults
+MIN_HEIGHT, MAX_HEIGHT = 64, 8192  # rows of panoramas that are predicted from
 
 Height = Annotated[int, Meta(ge=MIN_HEIGHT, le=MAX_HEIGHT)]
 """Height of panoramas to predict from, pixels."""
@@ -67,7 +67,7 @@ NUMBERS = ConstructorRegistry()
 def _parse_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     def parse(words: list[str]) -> Any:
         if words[0] == "None":
-            raise ValueError("no number")  # an optional number is absent
+            raise ValueError("no number")  # None, for an optional number that is not given
         for kind in (info.type, float):
             with contextlib.suppress(ValueError):
                 return kind(words[0])

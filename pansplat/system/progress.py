@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 
-POSED = 0.5  # fraction of the work that is done when poses had to be estimated
-CONNECTED = 0.05  # when only the overlaps of a tour had to be measured
+POSED = 0.5  # fraction of the work that is done when poses had to be estimated first
+CONNECTED = 0.05  # fraction of the work that is done when only the overlaps of a tour had to be measured first
 
 Show = Callable[[str, float], None]  # current step, fraction done in [0, 1]
 

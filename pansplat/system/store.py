@@ -35,16 +35,16 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.system.atomic import is_unfinished, replacing
 from pansplat.system.files import expand_home, read_file
 
-LIMIT = 4 << 30  # bytes of the entries of a folder
+LIMIT = 4 << 30  # bytes that the entries of a folder may take; the least recently used are removed
 _SUFFIX = ".entry"
-_FORMER_SUFFIXES = (".scene", ".npz")  # of entries of earlier versions, which are removed like others
-_IN_USE_SECONDS = 3600.0  # since the last use by another process
-_ABANDONED_SECONDS = 3600.0  # after which an unfinished file is that of a process that was killed
-_FORMAT = "1"  # of entries; part of their keys
-_TREE = "tree"  # name of the metadata
+_FORMER_SUFFIXES = (".scene", ".npz")  # entries of earlier versions of pansplat, which are removed like others
+_IN_USE_SECONDS = 3600.0  # seconds: between two lines; of the longest whole time stated
+_ABANDONED_SECONDS = 3600.0  # an unfinished file that is older is that of a process that was killed
+_FORMAT = "1"  # version of the entries' format, which is part of their keys
+_TREE = "tree"  # name of an entry's metadata
 
-_used: set[str] = set()  # entries of this process
-_block: ContextVar[str] = ContextVar("block", default="")  # name of one without caches
+_used: set[str] = set()  # paths of the entries that this process used, which are not removed
+_block: ContextVar[str] = ContextVar("block", default="")  # names the temporary folder of a block without caches
 
 Value = TypeVar("Value")
 
@@ -113,7 +113,7 @@ class Store:
             return None
         _used.add(str(path))
         with contextlib.suppress(OSError):
-            os.utime(path)  # the time of its last use
+            os.utime(path)  # the modification time states when the entry was last used
         return value
 
 
@@ -139,7 +139,7 @@ def hash_file(path: Path) -> str:
 
 @lru_cache(maxsize=1 << 16)
 def _hash_content(path: Path, state: tuple[int, ...]) -> str:
-    del state  # part of the key of the cache
+    del state  # it is only part of the key of the cache
     return hashlib.sha256(read_file(path)).hexdigest()[:32]
 
 
@@ -147,7 +147,7 @@ def cache_folders(folder: Path) -> list[Path]:
     """Folders for what is computed from a folder's panoramas, in order of preference."""
     folder_hash = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=8).hexdigest()
     folders = [folder / ".pansplat"]
-    with contextlib.suppress(InputError):  # no home folder
+    with contextlib.suppress(InputError):  # there may be no home folder
         home = os.environ.get("XDG_CACHE_HOME") or expand_home("~/.cache")
         folders.append(Path(home) / "pansplat" / folder_hash)
     block = _block.get()
@@ -157,7 +157,7 @@ def cache_folders(folder: Path) -> list[Path]:
 @cache
 def _name_temporary() -> Path:
     """The temporary folder of this process, which is made when a file is written."""
-    base = os.devnull  # below which nothing can be written
+    base = os.devnull  # nothing can be written below it
     with contextlib.suppress(OSError):
         base = tempfile.gettempdir()
     folder = Path(base) / f"pansplat-{secrets.token_hex(8)}"
@@ -172,7 +172,7 @@ def write_cache_file(folders: Sequence[Path], name: str, content: bytes) -> Path
             if folder.parent == _name_temporary():
                 folder.parent.mkdir(0o700, exist_ok=True)
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            if (folder / name).is_symlink():  # made by whoever made the folder
+            if (folder / name).is_symlink():  # whoever made the folder could redirect its files
                 (folder / name).unlink()
             with replacing(folder / name) as unfinished:
                 unfinished.write_bytes(content)

@@ -18,12 +18,12 @@ import msgspec
 from pansplat.errors import InputError
 from pansplat.system.files import read_file
 
-MAX_BYTES = 1 << 28  # of a file
-MAX_DEPTH = 32  # levels of lists and objects
-MAX_DIGITS = 18  # of a whole number, which then fits 64 bits
+MAX_BYTES = 1 << 28  # bytes of the largest file that is read
+MAX_DEPTH = 32  # deepest nesting of lists and objects
+MAX_DIGITS = 18  # largest length of a whole number, which then fits 64 bits
 
-_SHOWN = 60  # characters of a value in a message
-_WORDS = {
+_QUOTED = 60  # part of a wrong value that a message quotes
+_TYPE_WORDS = {
     "int": "a whole number", "float": "a number", "str": "a text", "bool": "true or false", "array": "a list",
     "object": "an object {...}", "Tensor": "a tensor",
 }  # fmt: skip
@@ -51,7 +51,7 @@ def parse_json(text: str, source: object) -> Any:
         if len(content) < len(pairs):
             seen: set[str] = set()
             key = next(key for key, _ in pairs if key in seen or seen.add(key))
-            raise InputError(f"{source}: needed each key once, got {key!a:.{_SHOWN}} twice; remove one.")
+            raise InputError(f"{source}: needed each key once, got {key!a:.{_QUOTED}} twice; remove one.")
         return content
 
     def as_whole(digits: str) -> float:
@@ -72,7 +72,7 @@ def parse_json(text: str, source: object) -> Any:
 
 def _check(value: Any, source: object) -> None:
     """Check depth, numbers and strings. Iterative: a recursion over a foreign value may overflow the stack."""
-    pending: list[tuple[Any, str, int]] = [(value, "", 0)]  # value, name, depth
+    pending: list[tuple[Any, str, int]] = [(value, "", 0)]  # value, name, depth of nesting
     while pending:
         value, name, depth = pending.pop()
         if depth >= MAX_DEPTH and isinstance(value, (dict, list)):
@@ -86,7 +86,7 @@ def _check(value: Any, source: object) -> None:
             needed = f"a finite number of at most {MAX_DIGITS} digits, got NaN or infinite numbers, or too many digits"
             raise InputError(f"{_locate(source, name)}: needed {needed}; correct it.")
         if isinstance(value, str) and value.encode(errors="replace").decode() != value:
-            raise InputError(f"{_locate(source, name)}: needed valid Unicode, got {value!a:.{_SHOWN}}; correct it.")
+            raise InputError(f"{_locate(source, name)}: needed valid Unicode, got {value!a:.{_QUOTED}}; correct it.")
 
 
 def _locate(source: object, name: str) -> str:
@@ -103,7 +103,7 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
     try:
         return msgspec.convert(value, kind, strict=strict)
     except UnicodeEncodeError as error:
-        raise InputError(f"{source}: needed valid Unicode, got {error.object!a:.{_SHOWN}}; correct it.") from error
+        raise InputError(f"{source}: needed valid Unicode, got {error.object!a:.{_QUOTED}}; correct it.") from error
     except msgspec.ValidationError as error:
         found = re.fullmatch(r"(.*?)(?: - at (?:`key` in )?`\$(.*)`)?", str(error), re.DOTALL)
         problem, path = found[1], found[2] or ""
@@ -114,12 +114,12 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
             name, is_missing = repr(field[2]), field[1] == "missing"
             problem = f"the field {name}, got none; add" if is_missing else f"only known fields, got {name}; correct"
             raise InputError(f"{where}: needed {problem} it.") from error
-        if not re.match("Expected|Invalid|Number out", problem):  # of a `__post_init__`
+        if not re.match("Expected|Invalid|Number out", problem):  # a message of our own, from a `__post_init__`
             raise InputError(f"{where}: {problem}; correct it.") from error
-        problem = re.sub(r"`(.+?)`", lambda m: " or ".join(_WORDS.get(w, w) for w in m[1].split(" | ")), problem)
+        problem = re.sub(r"`(.+?)`", lambda m: " or ".join(_TYPE_WORDS.get(w, w) for w in m[1].split(" | ")), problem)
         problem = re.sub(", got .*", "", problem).replace("Expected", "needed")
         problem = re.sub("^(Invalid|Number).*", "needed a known value", problem)
-        raise InputError(f"{where}: {problem}, got {value!r:.{_SHOWN}}; correct it.") from error
+        raise InputError(f"{where}: {problem}, got {value!r:.{_QUOTED}}; correct it.") from error
 
 
 def read_field(content: Mapping[str, Any], key: str, kind: Any, source: object, default: Any = None) -> Any:

@@ -13,9 +13,9 @@ from threadpoolctl import threadpool_limits
 
 _T = TypeVar("_T")
 _lock = threading.Lock()
-_num_running = 0  # sections that are running
-_num_threads = 1  # outside of all sections
-_blas: threadpool_limits | None = None  # the limit of matrix products in sections
+_num_running = 0  # sections that are running now
+_num_threads = 1  # torch's threads outside of all sections
+_blas: threadpool_limits | None = None  # the limit of threads for matrix products during sections
 
 
 @contextlib.contextmanager

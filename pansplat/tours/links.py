@@ -1,4 +1,4 @@
-"""Where the links of a tour are in space, the way along a link and its ring on the floor, and links through walls."""
+"""Where the rings of links are in space, and links through walls."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pansplat.tours.outlook import find_bin
 
 RING_RADIUS = 0.22  # metres, on the floor
 RING_DISTANCE = 0.66  # metres from the camera, within which a panorama has no ring
-_WAY_METRES = 0.7  # that the camera goes along a link, before the fade
 _NEAREST_METRES = 1.0  # of a link's ring
 _WALL_METRES = 3.0  # usual distance of a wall
 _MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical
@@ -32,12 +31,6 @@ def link_parts(tour: TourGraph) -> TourGraph:
             panoramas[start] = dataclasses.replace(panoramas[start], links=(*panoramas[start].links, link))
         joined.add(parts)
     return dataclasses.replace(tour, panoramas=tuple(panoramas)) if tour.walls else tour
-
-
-def find_way_along_link(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
-    """The level way of 0.7 m, in world axes, along the link between nodes; None without one, or if it is vertical."""
-    direction = _find_level_direction(tour, start, end)
-    return None if direction is None else _WAY_METRES * direction
 
 
 def find_link_ring(

@@ -1,11 +1,11 @@
-"""What there is to see at a panorama: where a way ends there, and which marks furniture hides."""
+"""What there is to see at a panorama: how far, and which marks furniture hides."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.surfaces import OPAQUE, locate_surfaces
@@ -14,7 +14,6 @@ BINS = 24  # of the horizon; the first one begins at the yaw -pi
 _ROWS = 12  # of clearances, from above to below
 _NEAREST = 0.1  # quantile of the distances of surfaces in one direction
 _ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and below the horizon
-_WALL = 1.2  # metres, the distance of surfaces below which a view faces a wall
 _WINDOW = 3  # bins of a view, 45 degrees
 _CONE = math.cos(math.radians(2))  # around the direction of a mark
 _IN_FRONT, _HIDING = 0.8, 0.5  # of its distance, and the share of the surfaces there that hide it
@@ -62,36 +61,16 @@ def _find_cells(offsets: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     return rows * BINS + ((np.arctan2(right, forward) / (2 * math.pi) + 0.5) * BINS).astype(int) % BINS
 
 
-def choose_arrival(
-    outlook: Float[np.ndarray, "bin"], yaw: float, pitch: float = 0.0, start: tuple[float, float] | None = None
-) -> tuple[float, float]:
-    """Yaw and pitch at which a way ends: the start view, else the given ones, but those of the widest view if these
-    face a wall.
-
-    Args:
-        outlook: of `measure_outlook`; zeros if it is unknown.
-        yaw, pitch: with which the camera arrives, radians.
-        start: yaw and pitch of the panorama's start view.
-    """
-    is_turned, ahead = find_turned(outlook, start)
-    return ahead if is_turned[find_bin(yaw)] else (yaw, pitch)
-
-
 def find_bin(yaw: float) -> int:
     """The bin of an outlook in a direction."""
     return int((yaw / (2 * math.pi) + 0.5) * BINS) % BINS
 
 
-def find_turned(
-    outlook: Float[np.ndarray, "bin"], start: tuple[float, float] | None = None
-) -> tuple[Bool[np.ndarray, "bin"], tuple[float, float]]:
-    """From which directions `choose_arrival` turns, and the yaw and pitch to which it does."""
+def find_widest(outlook: Float[np.ndarray, "bin"]) -> float:
+    """The yaw in which a camera sees furthest, over 45 degrees, radians."""
     around = np.stack([np.roll(outlook, shift) for shift in range(-(_WINDOW // 2), _WINDOW // 2 + 1)])
-    counts = (around > 0).sum(axis=0)  # nothing is seen in the sky
-    views = around.sum(axis=0) / np.maximum(counts, 1)
-    if start is not None:
-        return np.ones(BINS, dtype=bool), start
-    return (views < _WALL) & (counts > 0), (((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi, 0.0)
+    views = around.sum(axis=0) / np.maximum((around > 0).sum(axis=0), 1)  # nothing is seen in the sky
+    return ((int(views.argmax()) + 0.5) / BINS - 0.5) * 2 * math.pi
 
 
 def find_hidden(places: Float[np.ndarray, "n 3"], marks: Float[np.ndarray, "mark 3"]) -> list[int]:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from pansplat.geometry.path import turn_axes, wrap_angle
 from pansplat.tours.graph import Edge, TourGraph
-from pansplat.tours.outlook import find_turned
+from pansplat.tours.outlook import find_widest
 
 FADE_SECONDS = 1.0
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
@@ -267,7 +267,7 @@ class _Planner:
             return math.atan2(right, forward), 0.0
         is_known = self.tour.worlds[start] == self.tour.worlds[end] or end not in self.outlooks
         return self.find_start_view(end) or (
-            self.camera[3:].tolist() if is_known else find_turned(self.outlooks[end])[1]
+            self.camera[3:].tolist() if is_known else (find_widest(self.outlooks[end]), 0.0)
         )
 
     def find_start_view(self, node: int) -> tuple[float, float] | None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pansplat.inputs.views import Sample, Views
 
-_COLOUR = 0.1  # strength of changes of brightness, contrast, hue and gamma
+_COLOUR = 0.1  # scale of random changes of brightness, contrast, hue and gamma
 _MIRROR = torch.diag(torch.tensor((-1.0, 1.0, 1.0, 1.0), dtype=torch.float64))
 
 
@@ -39,7 +39,7 @@ def augment(sample: Sample, generator: np.random.Generator) -> Sample:
 def roll_views(views: Views, columns: list[int]) -> Views:
     """Rotate cameras about their vertical axes: pixels move right by whole columns."""
     width = views.images.shape[-1]
-    angles = torch.tensor(columns, dtype=torch.float64) * (-2 * math.pi / width)  # +z moves towards +x
+    angles = torch.tensor(columns, dtype=torch.float64) * (-2 * math.pi / width)  # forward, +z, moves towards +x
     sine, cosine, zero, one = angles.sin(), angles.cos(), torch.zeros_like(angles), torch.ones_like(angles)
     rotations = torch.stack((cosine, zero, sine, zero, one, zero, -sine, zero, cosine), dim=-1).reshape(-1, 3, 3)
     cam2world = views.cam2world.clone()

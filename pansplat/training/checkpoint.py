@@ -44,7 +44,7 @@ def save_checkpoint(folder: Path, step: int, state: Mapping[str, Any], *, keep: 
     """
     path = folder / f"step_{step:08d}.pt"
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(path, failures=(RuntimeError,)) as partial, open(partial, "wb") as file:  # torch's error: disk full
+    with replacing(path, failures=(RuntimeError,)) as partial, open(partial, "wb") as file:  # torch's if a disk is full
         torch.save({"kind": _KIND, "format": _FORMAT, "step": step, **state}, file)
         file.flush()
         os.fsync(file.fileno())

@@ -196,8 +196,8 @@ def _differences(old: object, new: object, name: str = "") -> list[str]:
 # weights of the official code, with which the published checkpoints were trained. Numbers of steps follow from epochs,
 # numbers of samples and batch sizes.
 
-_TRIPLETS = 19_950  # of Matterport3D
-_SEQUENCES = 13  # of 360Loc
+_TRIPLETS = 19_950  # training samples of Matterport3D
+_SEQUENCES = 13  # training sequences of 360Loc
 _MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=False)
 _PLAIN = MemoryConfig(style="cubemap")
 _TILED_2X2 = MemoryConfig("two-step", 2, "cubemap")
@@ -261,7 +261,7 @@ def _small_preset(
 _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     "tiny": (
         "no files, about 4 minutes on two idle cores: a very small network, rooms of boxes, 64x128",
-        _small_preset("tiny", (64,), 300, 2, 2e-3, 100, DataConfig(workers=0)),  # workers would start for seconds
+        _small_preset("tiny", (64,), 300, 2, 2e-3, 100, DataConfig(workers=0)),  # workers would take seconds to start
     ),
     "small": (
         "a day on a CPU: a small network, triplets (of `pansplat-homes`, for example), 128x256 then 256x512",

@@ -112,7 +112,7 @@ def backpropagate(
         for item, view in itertools.product(*map(range, problem.images.shape[:2])):
             gaussians = _lift_tile(network, maps.leaves, item, view, tiles, number)
             _backpropagate_gaussians(gaussians, tile.gaussians[item], view)
-        tile.gaussians.clear()  # frees memory for the next tile
+        tile.gaussians.clear()
     maps.backward()
     return (loss + _zero_if_none(match_loss)).detach(), terms | match_terms
 

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from pansplat.system.atomic import replacing
 
-_SMOOTHING = 20  # the thick curve averages over a 20th of the steps
+_SMOOTHING = 20  # divides the number of steps; the thick curve averages over the quotient
 
 
 class CsvTable:

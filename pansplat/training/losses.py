@@ -158,9 +158,9 @@ def weighted_mean(errors: Float[Tensor, "*shape"], weights: Tensor) -> Float[Ten
 
 PerceptualName = Literal["auto", "lpips-vgg", "lpips-alex", "lpips-squeeze", "structure"]
 
-_SCALES = 3  # at which images are compared, each half the size of the one before
-_SIGMA, _RADIUS = 1.5, 5  # pixels
-_C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
+_SCALES = 3  # scales at which images are compared, each half the size of the one before
+_SIGMA, _RADIUS = 1.5, 5  # pixels; standard deviation and radius of the window
+_C1, _C2 = 0.01**2, 0.03**2  # squares of SSIM's K1 and K2, for images in [0, 1]
 _BACKBONES: dict[str, Backbone] = {"lpips-vgg": "vgg", "lpips-alex": "alex", "lpips-squeeze": "squeeze"}
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 _START_DIVISOR = 25.0  # peak rate over first rate
 _END_DIVISOR = 1e4  # first rate over last rate
-_RISE = 0.01  # fraction of the steps in which the rate rises
+_RISE = 0.01  # fraction of the steps during which the rate rises
 
 
 def one_cycle_rate(step: int, total: int, peak: float) -> float:

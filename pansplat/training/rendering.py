@@ -28,9 +28,9 @@ from pansplat.rendering.rasterize import RasterOptions, Rendering, rasterize
 from pansplat.training.config import Mixing, Style
 
 _FACES = 6
-_STRIPS = 6  # of equal area on the sphere
+_STRIPS = 6  # parts of equal area on the sphere
 _OPTIONS = RasterOptions()
-_CHUNK = 1 << 16  # Gaussians per visibility test, because their geometry is float64
+_CHUNK = 1 << 16  # Gaussians per visibility test, whose geometry is float64
 
 
 @dataclass(frozen=True)

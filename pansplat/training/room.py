@@ -19,11 +19,11 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.pairs import FAR, NEAR
 from pansplat.inputs.views import Sample, Views
 
-_FREE = ((-2.0, -0.6, -1.7), (1.9, 0.6, 0.8))  # corners of a box half a metre from all surfaces, metres
-_STRETCH = (0.9, 1.4)  # of the room along each axis
-_BASELINE = (0.3, 2.0)  # between the two inputs, metres
-_WAVES = (4.0, 25.0)  # of the patterns, radians per metre
-_RAYS = 2  # along each side of a pixel
+_FREE_BOX = ((-2.0, -0.6, -1.7), (1.9, 0.6, 0.8))  # metres; corners of a box that is half a metre from all surfaces
+_STRETCH = (0.9, 1.4)  # range of the factors of the room's size along each axis
+_BASELINE = (0.3, 2.0)  # metres; range of the distance between the two inputs
+_WAVE_NUMBERS = (4.0, 25.0)  # radians per metre; range of the patterns' wave numbers
+_RAYS = 2  # rays along each side of a pixel
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class _Room:
         self._colors = torch.from_numpy(rng.uniform(0.25, 0.75, (NUM_SURFACES, 3)))
         self._contrast = torch.from_numpy(rng.uniform(-0.25, 0.25, (NUM_SURFACES, 3)))
         directions = rng.normal(size=(NUM_SURFACES, 2, 3))
-        lengths = np.exp(rng.uniform(*np.log(_WAVES), (NUM_SURFACES, 2, 1)))
+        lengths = np.exp(rng.uniform(*np.log(_WAVE_NUMBERS), (NUM_SURFACES, 2, 1)))
         self._waves = torch.from_numpy(lengths * directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def render(self, places: Float[Tensor, "view 3"], height: int, names: tuple[str, ...]) -> Views:
@@ -95,7 +95,7 @@ class _Room:
 
 def _sample_places(stretch: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Three places (3 3) in the free space of a room; the second is near the middle of the others."""
-    low, high = np.array(_FREE) * stretch
+    low, high = np.array(_FREE_BOX) * stretch
     while True:
         start, direction = rng.uniform(low, high), rng.normal(size=3) * (1, 0.1, 1)
         length = rng.uniform(*_BASELINE)

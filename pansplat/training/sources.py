@@ -31,7 +31,7 @@ from pansplat.training.sequences import (
     read_loc360,
 )
 
-_VALIDATION_SEED_OFFSET = 1_000_003  # rooms differ from those of training
+_VALIDATION_SEED_OFFSET = 1_000_003  # added to the seed, so that rooms differ from those of training
 _VALIDATION_DRAWS = 4  # frame pairs per sequence
 
 

@@ -40,8 +40,8 @@ from pansplat.training.step import LOSS_TERMS, TrainingStep
 from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, describe_measures, validate
 
-_EXTRA_STEPS = 10  # of the learning-rate schedule beyond the last step, as in the official code
-_TINY_SECONDS = 0.7  # of a step of `tiny` on two cores (docs/training.md)
+_EXTRA_STEPS = 10  # steps of the learning rate's schedule beyond the last step, as in the official code
+_TINY_SECONDS = 0.7  # time of a step of `tiny` on two cores (docs/training.md)
 _COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
 
 
@@ -112,7 +112,7 @@ class Trainer:
                 if self.resumed_from is not None:
                     progress.print(f"resuming from {self.resumed_from}")
                 elif self.config.validation.every:
-                    self._validate(logs, progress)  # the untrained network, for comparison
+                    self._validate(logs, progress)  # the untrained network is compared with later ones
                 for batch in self._batches():
                     began = time.perf_counter()
                     values = self._optimize(batch)

@@ -21,6 +21,7 @@ const PAUSE_MS = 1000; // a longer frame is not measured
 const REST_MS = 200; // after a change, until the full resolution is drawn
 export const SORT_DISTANCE = 0.01; // metres from the point for which a headset's Gaussians are sorted
 const LEAST_SCALE = 0.25; // of the resolution
+const EXPOSURE_MS = 1000 / 30; // of a frame of a flight, at most, by which its Gaussians blur
 const scales = [1, 1]; // of the resolution while it moves: of Gaussians, and of photographs
 let lastFrame = 0;
 
@@ -50,6 +51,7 @@ export function onFrame(now) {
   requestAnimationFrame(onFrame);
   if (state.headset.session) return; // it has frames of its own
   const elapsed = now - lastFrame, seconds = Math.min(elapsed, 100) / 1000;
+  const before = [...camera.position];
   lastFrame = now;
   if (state.doll.isOn) orbitByKeys(state.step, seconds);
   else if (state.step.some((value) => value)) walk(...scaled(state.step, seconds * HEADER.speed * (state.isFast ? HEADER.fast : 1)));
@@ -62,7 +64,8 @@ export function onFrame(now) {
   if (!state.renderer || !(state.sorted || photographs.isOpaque) || !(state.isDirty || wanted > state.drawnScale)) return;
   state.isDirty = false;
   state.drawnScale = wanted;
-  const rotation = drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1)));
+  const shift = scaled(minus(camera.position, before), state.flight && !state.still ? Math.min(EXPOSURE_MS / Math.max(elapsed, 1), 1) : 0);
+  const rotation = drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1)), shift);
   placeRings(rotation);
   showMarks(rotation);
   showPlace();

@@ -8,10 +8,11 @@ import { drawHouse } from "./house.js";
 import { photographs } from "./photographs.js";
 import { camera, changed, state } from "./state.js";
 
-export function drawAt(width, height) {
+// `shift`: of the camera during the exposure, by which Gaussians blur.
+export function drawAt(width, height, shift) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   const rotation = rotationOf(camera), tangent = tangentOf(width, height), half = [tangent * width / height, tangent];
-  const seen = { position: camera.position, rotation, center: [0, 0], half };
+  const seen = { position: camera.position, rotation, center: [0, 0], half, shift };
   if (state.doll.isOn) drawHouse(seen, width, height);
   else if (!photographs.isOpaque) state.renderer.draw(seen, blendWeights(seen), null, [0, 0, width, height]);
   photographs.draw(seen, width, height);

@@ -1,6 +1,6 @@
 // Draws the Gaussians of HEADER's views with WebGL 2 (docs/rendering.md), as they arrive.
 
-import { scaled } from "./graph.js";
+import { column, dot, scaled } from "./graph.js";
 
 const TEXTURE_WIDTH = 2048; // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
@@ -146,7 +146,8 @@ export class Renderer {
   }
 
   // Draws to a viewport (left, bottom, width, height) of a framebuffer, null for the canvas. `camera` has a `position`,
-  // a `rotation` (camera to world), and the `center` and `half` the size of the image on the image plane.
+  // a `rotation` (camera to world), the `center` and `half` the size of the image on the image plane, and while it moves a
+  // `shift` during the exposure, world axes.
   draw(camera, weights, framebuffer, [left, bottom, width, height]) {
     const gl = this.gl;
     this.resize(width, height);
@@ -180,13 +181,14 @@ export class Renderer {
     return coverage > 0.5 ? distance / coverage : null;
   }
 
-  setCamera({ position, rotation, center, half }, width, height) {
+  setCamera({ position, rotation, center, half, shift = [0, 0, 0] }, width, height) {
     const gl = this.gl, { program, places } = this.splat;
     const [[x, y], [w, h]] = [center, half], focal = [0.5 * width / w, 0.5 * height / h];
     gl.useProgram(program);
     // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
     gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
     gl.uniform3fv(places.position, position);
+    gl.uniform3fv(places.shift, [0, 1, 2].map((k) => dot(column(rotation, k), shift) / Math.sqrt(12)));
     gl.uniform1f(places.near, HEADER.near);
     gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
     gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);

@@ -160,7 +160,7 @@ def test_a_pair_is_merged_to_the_limit_of_its_page_before_its_refinement(
 def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(export_module, "_FEW_GAUSSIANS", 300_000)
+    monkeypatch.setattr(export_module, "_MIN_GAUSSIANS", 300_000)
     first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
     alone = dataclasses.replace(second.context[1], world=1, title="Attic")
     single = dataclasses.replace(second, context=(alone,))

@@ -143,6 +143,8 @@ REFUSED = {
     "render room -o x.png --model sphere --precision bfloat16": "`precision` is for networks",
     "export scene.ply -o x.ply --serve": "--serve is for an .html page, got x.ply",
     "export scene.ply -o x.ply --photo-height 1024": "--photo-height is for an .html page, got x.ply",
+    "export room -o x.html --address https://a.b": "--address: needed https://... and a folder",
+    "export room -o x --address a.b": "--address: needed https://... and a folder",
     "export scene.ply -o x.stl": ".sog, .glb, .ply",
     "export scene.ply -o x.spz --points": "--points is for a .ply",
     "export scene.ply -o x.png --points": "--points is for a .ply",

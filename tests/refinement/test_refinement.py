@@ -105,7 +105,7 @@ def test_pose_errors_are_corrected(room, monkeypatch) -> None:
         room.truth, cam2world=poses, gaussians=dataclasses.replace(gaussians, means=means.float())
     )
     views = dataclasses.replace(room.views, cam2world=poses)
-    monkeypatch.setattr(module, "_POSE_HOLD", 1.0)
+    monkeypatch.setattr(module, "_POSE_PENALTY", 1.0)
     refined, _ = _refine(room, scene=scene, views=views, steps=150, poses=True)
 
     def relative_angle(pair: torch.Tensor) -> float:
@@ -151,7 +151,7 @@ def test_what_is_in_neither_photograph_is_an_error_of_pictures_between_them(room
     refinement = Refinement(joint, room.views)
     given = refinement.half_way_error()
     monkeypatch.setattr(Refinement, "_build", lambda self, layer: Gaussians.cat([joint.gaussians, ball]))
-    assert refinement.half_way_error() > module._ALLOWANCE * given
+    assert refinement.half_way_error() > module._MAX_ERROR_RATIO * given
     masks = torch.zeros_like(room.views.masks)
     assert Refinement(joint, dataclasses.replace(room.views, masks=masks)).half_way_error() == 0
 
@@ -180,7 +180,7 @@ def test_the_last_state_is_kept_whose_pictures_between_the_cameras_are_as_good_a
 
 
 def test_a_scene_whose_pictures_would_be_torn_is_left_as_it_is_and_that_is_said(room, monkeypatch) -> None:
-    monkeypatch.setattr(module, "_ALLOWANCE", 0.0)
+    monkeypatch.setattr(module, "_MAX_ERROR_RATIO", 0.0)
     with pytest.warns(InputWarning, match="left, right: not refined"):
         kept = pansplat.refine(room.predicted, room.views, steps=4)
     assert all(torch.equal(a, b) for a, b in zip(_tensors(kept), _tensors(room.predicted), strict=True))
@@ -194,7 +194,7 @@ def test_a_run_is_judged_before_it_fits_the_held_out_blocks(room, monkeypatch: p
     report = refinement.run(steps=8)
     assert (report.stopped, report.before, report.after) == ("worse", 1.0, 2.0)
     assert refinement.scene() is room.predicted and report.steps == len(fractions) == 6
-    assert max(fractions) < module._RELEASE
+    assert max(fractions) < module._RELEASE_AT
 
 
 def test_a_stagnating_run_ends_early_with_its_last_part(room) -> None:

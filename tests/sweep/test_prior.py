@@ -148,7 +148,8 @@ def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap,
     priors = [
         DepthPrior(generator.uniform(0, 1, shape), generator.uniform(0.01, 0.5, shape)) for _ in range(count_priors)
     ]
-    for name, value in {"_WEIGHT": 0.7, "_CAP": cap, "_MIN_SCALE": 0.1, "_FURTHER_PENALTY": 0.4}.items():
+    numbers = {"_DEVIATION_COST": 0.7, "_MAX_DEVIATION": cap, "_MIN_SCALE": 0.1, "_FURTHER_PENALTY": 0.4}
+    for name, value in numbers.items():
         monkeypatch.setattr(prior_module, name, value)
     cost = np.ones((*shape, count), np.float32)
     apply_prior_cost(cost, priors, [hypotheses])

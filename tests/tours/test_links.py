@@ -7,7 +7,7 @@ import numpy as np
 
 from pansplat.inputs.pairs import Link
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.links import find_link_ring, find_way_along_link
+from pansplat.tours.links import find_link_ring
 from pansplat.tours.outlook import BINS, find_bin
 
 
@@ -20,9 +20,8 @@ def _link(tour: TourGraph, pitch: float) -> TourGraph:
 def test_a_ring_is_where_the_link_meets_the_floor_a_metre_away_at_least(make_tour) -> None:
     for pitch, distance in ((math.atan(0.75), 2.0), (1.4, 1.0)):
         tour = _link(make_tour(((0, 0), (0, 1)), ((0, 0), (1, 1))), pitch)
-        ring, way = find_link_ring(tour, 0, 1, 1.5), find_way_along_link(tour, 0, 1)
+        ring = find_link_ring(tour, 0, 1, 1.5)
         assert np.allclose(ring, (distance, 1.5, 0)), "metres to the right, and down"
-        assert np.allclose(way, (0.7, 0, 0))
 
 
 def test_a_ring_off_the_floor_is_on_the_wall_in_the_direction_of_the_link(make_tour) -> None:
@@ -36,5 +35,5 @@ def test_a_ring_off_the_floor_is_on_the_wall_in_the_direction_of_the_link(make_t
 
 def test_a_vertical_link_and_none_have_no_ring(make_tour) -> None:
     tour = _link(make_tour(((0, 0), (0, 1)), ((0, 0), (1, 1))), 0.5 * math.pi)
-    assert find_link_ring(tour, 0, 1, 1.5) is None and find_way_along_link(tour, 0, 1) is None
-    assert find_link_ring(tour, 1, 0, 1.5) is None and find_way_along_link(tour, 1, 0) is None
+    assert find_link_ring(tour, 0, 1, 1.5) is None
+    assert find_link_ring(tour, 1, 0, 1.5) is None

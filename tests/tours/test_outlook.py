@@ -11,10 +11,9 @@ from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.outlook import (
     BINS,
-    choose_arrival,
     find_clearance,
     find_hidden,
-    find_turned,
+    find_widest,
     measure_clearance,
     measure_outlook,
 )
@@ -46,37 +45,14 @@ def test_the_clearance_is_the_distance_of_the_room_around():
     assert not nothing.any() and find_clearance(nothing, np.array((0.0, 0.0, 1.0))) == math.inf
 
 
-def test_an_arrival_turns_from_a_wall_to_the_widest_view():
-    wall = np.full(BINS, 3.0)
-    wall[BINS // 2 - 3 : BINS // 2 + 4] = 0.6  # ahead, yaw 0
-    wall[2:5] = 8.0  # behind on the left
-    turned, pitch = choose_arrival(wall, 0.0, 0.3)
-    assert turned == pytest.approx((3.5 / BINS - 0.5) * 2 * math.pi) and pitch == 0
-    assert choose_arrival(wall, 1.5, 0.3) == (1.5, 0.3) and choose_arrival(np.zeros(BINS), 0.2) == (0.2, 0)
-
-
-def test_a_way_ends_in_the_start_view_whatever_is_there():
-    wide = np.full(BINS, 3.0)
-    assert (
-        choose_arrival(wide, 0.7, start=(-0.5, 0.2))
-        == choose_arrival(0.1 * wide, 2.0, start=(-0.5, 0.2))
-        == (-0.5, 0.2)
-    )
-
-
-def test_a_wall_nearer_than_1_2_metres_is_turned_from_in_rooms_of_any_size():
-    for size in (1.5, 3.0, 20.0):
-        wall = np.full(BINS, size)
-        wall[[0, 1, 2, -1, -2]] = 1.1
-        is_turned, ahead = find_turned(wall)
-        assert {0, 1, 23} <= {*np.flatnonzero(is_turned).tolist()} <= {0, 1, 2, 22, 23}
-        assert choose_arrival(wall, -math.pi + 0.1) == ahead and choose_arrival(wall, 0.0) == (0.0, 0.0)
-        wall[wall < 1.2] = 1.3
-        assert not find_turned(wall)[0].any()
+def test_the_widest_view_is_over_several_directions_and_the_sky_does_not_count():
+    outlook = np.full(BINS, 3.0)
+    outlook[2:5] = 8.0  # behind on the left
+    outlook[12] = 12.0  # a gap
+    assert find_widest(outlook) == pytest.approx((3.5 / BINS - 0.5) * 2 * math.pi)
     sky = np.zeros(BINS)
-    assert not find_turned(sky)[0].any()
-    sky[3] = 5.0  # of directions in which nothing is seen the others state the distance
-    assert not find_turned(sky)[0].any()
+    sky[6] = 5.0
+    assert find_widest(sky) == pytest.approx((5.5 / BINS - 0.5) * 2 * math.pi)
 
 
 def test_marks_are_hidden_by_what_is_in_front_of_them_only():

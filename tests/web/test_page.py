@@ -333,6 +333,21 @@ def test_merged_gaussians_of_a_scene_whose_views_are_unknown_keep_their_image(pl
         assert float((images[1] - images[0]).abs().mean()) < 0.05
 
 
+@pytest.mark.parametrize(
+    ("address", "base"), [(None, ""), ("https://a.b/home", "https://a.b/home/"), ("https://a.b/t.html", "https://a.b/")]
+)
+def test_a_folder_has_what_previews_of_links_show(
+    plain_scene: Scene, tmp_path: Path, address: str | None, base: str
+) -> None:
+    page = write_page(plain_scene, tmp_path / "index.html", split=True, title='My "home"', address=address)
+    found = dict(re.findall(r'<meta (?:name|property)="(.*?)" content="(.*?)">', page.files[0].read_text()))
+    assert found["og:title"] == "My &quot;home&quot;"
+    assert found["description"] == found["og:description"] == "2 panoramas: room 0, room 1"
+    (preview,) = (tmp_path / "index_files").glob("preview_*.jpg")
+    assert found["og:image"] == f"{base}index_files/{preview.name}" and preview in page.files
+    assert {file.name[:7] for file in page.files if file.suffix == ".bin"} == {"room-0_", "room-1_"}
+
+
 def test_a_title_cannot_leave_its_element(scene: Scene, tmp_path: Path) -> None:
     evil = dataclasses.replace(scene, names=("</script><script>alert(1)</script>", "<!--", "c"))
     write_page(evil, tmp_path / "tour.html", title="<b>&</title>")
@@ -352,9 +367,9 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(scene: Scene, tmp_path: 
     assert set((tmp_path / "tour_files").iterdir()) == {*second.files[1:], other}
     header = read_header(tmp_path / "tour.html")
     assert header["folder"] == "tour_files" and "<script src" not in text, "they are loaded when they are needed"
-    assert [name for view in header["views"] for name in view["files"]] == [file.name for file in second.files[1:]]
-    assert {file.suffix for file in second.files[1:]} == {".bin"} and "connect-src 'self'" in text
-    assert sum(len(gzip.decompress(file.read_bytes())) for file in second.files[1:]) % header["count"] == 0
+    assert [name for view in header["views"] for name in view["files"]] == [file.name for file in second.files[1:-1]]
+    assert {file.suffix for file in second.files[1:-1]} == {".bin"} and "connect-src 'self'" in text
+    assert sum(len(gzip.decompress(file.read_bytes())) for file in second.files[1:-1]) % header["count"] == 0
 
 
 @pytest.mark.parametrize("is_shared", [False, True])
@@ -410,7 +425,7 @@ def test_the_parts_of_a_copy_of_a_page_stay(scene: Scene, tmp_path: Path) -> Non
 def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Path, stem: str) -> None:
     written = write_page(scene, tmp_path / f"{stem}.html", split=True)
     header = read_header(written.files[0])
-    for view, file in zip(header["views"], written.files[1:], strict=True):  # one for each view
+    for view, file in zip(header["views"], written.files[1:-1], strict=True):  # one for each view, and the preview
         place = urlsplit(urljoin("file:///folder/page.html", f"{header['folder']}/{view['files'][0]}"))
         assert not place.query and not place.fragment
         assert unquote_to_bytes(place.path) == b"/folder/" + os.fsencode(f"{stem}_files/{file.name}")

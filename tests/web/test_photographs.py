@@ -20,9 +20,9 @@ from PIL import Image
 from pansplat.export import page as page_module
 from pansplat.export import photographs as module
 from pansplat.export.page import write_page
-from pansplat.export.photographs import PackedPhotograph, pack_photographs, read_photograph
+from pansplat.export.photographs import PackedPhotograph, label_files, pack_photographs, read_photograph
 from pansplat.gaussians.scene import Scene
-from pansplat.images.cube_images import equirect_from_faces
+from pansplat.images.cube_images import CubeImage, CubeLevel, equirect_from_faces, write_cube
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Pair
 from pansplat.system.files import SOFTWARE, is_written
@@ -125,13 +125,32 @@ def test_the_tiles_of_the_largest_level_are_the_photograph(
     photographs = take_photographs(scene, 1024)
     for view, packed in enumerate(pack(scene, photographs)):
         image, _ = read_panorama(photographs[view].context[0].image, 1024)
-        assert [size for size, _ in packed.levels] == [384, 672] and packed.height == 1024
+        assert [size for size, _ in packed.levels] == [384, 640] and packed.height == 1024
         for level, least in ((0, 34), (1, 38)):
             faces = decode_faces(packed, level)
             assert faces[0].shape == (packed.levels[level][0],) * 2 + (3,)
             seen = equirect_from_faces(faces, 1024) / 255
             assert psnr(seen, image.permute(1, 2, 0).numpy()) > least
         assert np.allclose(packed.rotation, scene.cam2world[view, :3, :3])
+
+
+@pytest.mark.parametrize("height", [None, 200])
+def test_faces_are_no_larger_than_those_of_their_source(
+    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path, height: int | None
+) -> None:
+    faces = tuple(f"{face}.png" for face in range(6))
+    for face in faces:
+        Image.new("RGB", (160, 160), PURPLE).save(tmp_path / face)
+    cube = write_cube(CubeImage(tmp_path, (CubeLevel(160, 160, faces),)), tmp_path, "room")
+    first, second, third = take_photographs(scene, 512)
+    first = dataclasses.replace(first, context=(dataclasses.replace(first.context[0], image=cube),))
+    sizes = [packed.levels[-1][0] for packed in pack(scene, [first, second, third], height=height)]
+    assert sizes == [160, 320, 320] if height is None else [112, 112, 112], "2 / pi of the rows, a multiple of 16"
+
+
+def test_names_of_files_are_those_of_panoramas_safe_in_addresses_and_different() -> None:
+    names = ["Living room", "Küche / 2", "living-room", "客厅", "<b>?&#", "a" * 99]
+    assert label_files(names) == ["living-room", "kuche-2", "living-room_2", "panorama", "b", "a" * 40]
 
 
 @pytest.mark.parametrize(("kind", "split"), [("mask", False), ("blur", True)])
@@ -193,7 +212,7 @@ def test_a_new_page_removes_the_tiles_of_the_old_one(
     first = write_page(plain_scene, tmp_path / "index.html", split=True, photographs=photographs)
     header = json.loads(re.findall(r"^const HEADER = (.*);$", first.files[0].read_text(), flags=re.MULTILINE)[0])
     assert header["folder"] == "index_files" and len(header["photographs"]) == 2
-    assert len(first.files) == 1 + 2 + 2 * 6 and all(file.is_file() for file in first.files)
+    assert len(first.files) == 1 + 2 + 2 * 6 + 1 and all(file.is_file() for file in first.files)
     assert all(is_written(file) for file in first.files)
     second = write_page(plain_scene, tmp_path / "index.html", split=True)
     assert second.photo_height == 0 and set((tmp_path / "index_files").iterdir()) == set(second.files[1:])

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
+_SHIFT_STEPS = 20  # a metre, to which the movement of an exposure is rounded up, so that selections serve several
 _MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4
@@ -305,7 +306,10 @@ class CpuRenderer:
         selection = None
         if not plane.is_panorama:
             camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
-            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle
+            widening = math.ceil(_SHIFT_STEPS * math.hypot(*frame.settings.shift)) / _SHIFT_STEPS
+            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle + widening / (
+                math.sqrt(12) * frame.settings.near
+            )
             selection = Selection(camera.compute_side_normals(), deviation)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
@@ -316,6 +320,7 @@ class CpuRenderer:
             selection=selection,
             cache=cache,
             min_transmittance=self._min_transmittance,
+            shift=frame.settings.shift,
         )
 
     def _find_scene(self, settings: DrawSettings) -> DisplayScene:

@@ -109,7 +109,7 @@ class Frame:
     def create_layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
-        key = (splats, self.position, s.levels, s.near, s.splat_colors)
+        key = (splats, self.position, s.levels, s.near, s.shift, s.splat_colors)
         if self.storage == LayerStorage.IMAGE:
             return (*key, self.rotation.tobytes(), self.focal)
         return (*key, self.faces_to_world.tobytes())

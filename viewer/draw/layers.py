@@ -6,6 +6,7 @@ splats with OpenGL: it projects Gaussians to records and rasterises the records 
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -256,7 +257,10 @@ class SplatRasterizer:
         self._set_uniforms(camera, place, settings)
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-        drawn = self._draw_in_order(splats.find_back_to_front(camera, selected, compute_filter_variance(camera.focal)))
+        widening = math.sqrt(compute_filter_variance(camera.focal)) + math.hypot(*settings.shift) / (
+            math.sqrt(12) * settings.near
+        )
+        drawn = self._draw_in_order(splats.find_back_to_front(camera, selected, widening**2))
         self._ctx.enable_only(moderngl.NOTHING)
         return drawn
 
@@ -283,6 +287,7 @@ class SplatRasterizer:
             filter_variance=compute_filter_variance(camera.focal),
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
+            shift=tuple((camera.rotation.T @ settings.shift / math.sqrt(12)).tolist()),
         )
         x, y, width, height = place
         set_uniforms(

@@ -37,6 +37,7 @@ class DrawSettings:
         cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
+        shift: movement of the camera while the picture is exposed, metres, world axes: Gaussians blur along it.
         scale: drawn pixels over those of the image, along each side, in (0, 1]. `CpuRenderer` enlarges the image;
             OpenGL returns the smaller texture, because a GPU enlarges it without cost.
     """
@@ -52,6 +53,7 @@ class DrawSettings:
     layout: Layout = "pinhole"  # `pinhole`, or `equirect`, which OpenGL stitches from six cube faces
     cached: bool = False
     scale: float = 1.0
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -27,6 +28,8 @@ from pansplat_viewer.ui.photographs import Photographs
 from pansplat_viewer.ui.presenter import PhotographLayer, PosedPhotograph, Presenter
 
 DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
+_EXPOSURE_SECONDS = 1 / 30  # of a frame of a flight, at most, by which its Gaussians blur
+_JUMP = 1.0  # metres between two frames, which no flight flies
 
 
 class Stage:
@@ -64,6 +67,7 @@ class Stage:
         self.size: tuple[int, int] = (1, 1)
         self.has_failed = False
         self.last_camera = state.camera
+        self._last_frame, self._shift = state.now, (0.0, 0.0, 0.0)  # its time, and the movement during the exposure
 
     def _create_slot(self) -> SceneSlot:
         return SceneSlot(create_renderer(self._ctx, self._choice))
@@ -244,7 +248,11 @@ class Stage:
         camera = self._state.camera
         moved = camera.position != self.last_camera.position
         turned = not moved and camera != self.last_camera
-        self.last_camera = camera
+        elapsed, moves = max(self._state.now - self._last_frame, 1e-3), self._state.playing
+        steps = [new - old for new, old in zip(camera.position, self.last_camera.position, strict=True)]
+        share = min(_EXPOSURE_SECONDS / elapsed, 1.0) if moves and math.hypot(*steps) < _JUMP else 0.0
+        self._shift = share * steps[0], share * steps[1], share * steps[2]
+        self.last_camera, self._last_frame = camera, self._state.now
         self.resolution.limit(self.size, self.renderer.pacing.min_size)
         return self.resolution.plan(self._state.now, moved=moved, turned=turned)
 
@@ -274,7 +282,7 @@ class Stage:
         self, slot: SceneSlot, cam2world: Float[np.ndarray, "4 4"], settings: DrawSettings, plan: ResolutionPlan
     ) -> float:
         """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
-        settings = replace(settings, cached=plan.cached)
+        settings = replace(settings, cached=plan.cached, shift=self._shift)
         if not (plan.cached and slot.renderer.has_faces(cam2world, self.size, settings)):
             settings = replace(settings, scale=plan.scale)
         wait = plan.moving and slot.renderer.pacing.waits_while_moving

@@ -30,17 +30,17 @@ _T = TypeVar("_T")
 CONVENTION = "world2cam opencv"
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 
-_MODELS = (  # by number: name and count of parameters
+_MODELS = (  # name and number of parameters of each camera model, by COLMAP's number
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
     ("EUCM", 6), ("EQUIRECTANGULAR", 2),
 )  # fmt: skip
 _FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
-_MAX_BYTES = 1 << 31  # of a file
-_MAX_POINTS = 200_000  # that are read, for near and far
-_MAX_NAME = 4096  # bytes
-_NOT_COMPUTED = -1  # error of a point
+_MAX_BYTES = 1 << 31  # bytes of the largest file that is read
+_MAX_POINTS = 200_000  # points that are read to find near and far
+_MAX_NAME = 4096  # bytes of the longest name of a picture
+_NOT_COMPUTED = -1  # what a point's error is where it is not known
 
 _Camera = tuple[str, int, int, list[float]]  # model, width, height, parameters
 _Image = tuple[list[float], list[float], int, str]  # quaternion, translation, camera, name
@@ -134,7 +134,7 @@ def _read_images_text(path: Path) -> Iterator[_Image]:
         row = line.split(maxsplit=9)
         numbers = [float(x) for x in row[1:8]]
         yield numbers[:4], numbers[4:], int(row[8]), row[9].strip()
-        next(lines, None)  # the points in the picture
+        next(lines, None)  # this line lists the points in the picture
 
 
 def _read_points_text(path: Path) -> Iterator[list[float]]:
@@ -207,7 +207,7 @@ def write_colmap(
         colors: 8-bit sRGB.
     """
     kinds = list(dict.fromkeys(tuple(lens for _, _, lens in pictures) for pictures in rigs))
-    starts = np.cumsum([1, *(len(lenses) for lenses in kinds)]).tolist()  # numbers of the cameras of each kind of rig
+    starts = np.cumsum([1, *(len(lenses) for lenses in kinds)]).tolist()  # the first camera of each kind of rig
     cameras, sensors, frames, images = [], [], [], []
     for number, lenses in enumerate(kinds):
         for camera, lens in enumerate(lenses, starts[number]):
@@ -236,11 +236,11 @@ def write_colmap(
     ]
     files = {"rigs": sensors, "cameras": cameras, "frames": frames, "images": images, "points3D": table}
     for name, lines in files.items():
-        text = "\n".join([f"# {_HEADS[name]}; {SOFTWARE}", *lines]) + "\n"
+        text = "\n".join([f"# {_COLUMNS[name]}; {SOFTWARE}", *lines]) + "\n"
         (folder / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
-_HEADS = {
+_COLUMNS = {
     "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, POSE)",
     "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
     "frames": "FRAME_ID, RIG_ID, RIG_FROM_WORLD, NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)",

@@ -22,8 +22,8 @@ from pansplat.inputs.reconstructions.shots import Reconstruction, find_picture, 
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import read_file
 
-_MAX_BYTES = 1 << 28  # of a file
-_HEAD = 4096  # bytes that show what a file is
+_MAX_BYTES = 1 << 28  # bytes of the largest file that is read
+_HEAD = 4096  # bytes at the start of a file from which its kind is known
 
 
 def find_metashape(folder: Path) -> list[Path]:

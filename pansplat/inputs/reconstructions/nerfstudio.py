@@ -49,7 +49,7 @@ _PLY_TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_MAX_PLY = 1 << 30  # bytes
+_MAX_PLY = 1 << 30  # bytes of the largest point cloud that is read
 
 
 def read_nerfstudio(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:

@@ -24,7 +24,7 @@ from pansplat.system.strict_json import read_json
 FILE = "sfm_data.json"
 
 _T = TypeVar("_T")
-_FIRST = 1 << 31  # flag of a type's number where its name is stated
+_NAMED = 1 << 31  # bit in a type's number that its name follows
 
 
 class _Item(Struct, Generic[_T]):
@@ -72,10 +72,10 @@ class _Content(Struct):
 def read_openmvg(source: Path, folder: Path, convention: str | None = None) -> Reconstruction:
     """The spherical views of a sfm_data.json that have a pose."""
     content = read_json(source, _Content)
-    kinds: dict[int, str] = {}  # the name of a type is stated once; then its number stands for it
+    kinds: dict[int, str] = {}  # names of types by number; a file states a name once
     for item in content.intrinsics:
-        kinds.setdefault(item.value.polymorphic_id % _FIRST, item.value.polymorphic_name)
-    spherical = {item.key for item in content.intrinsics if kinds[item.value.polymorphic_id % _FIRST] == "spherical"}
+        kinds.setdefault(item.value.polymorphic_id % _NAMED, item.value.polymorphic_name)
+    spherical = {item.key for item in content.intrinsics if kinds[item.value.polymorphic_id % _NAMED] == "spherical"}
     poses = {item.key: item.value for item in content.extrinsics}
     views = [item.value.ptr_wrapper.data for item in content.views]
     posed = [view for view in views if view.id_pose in poses and view.id_intrinsic in spherical]

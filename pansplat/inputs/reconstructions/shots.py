@@ -33,15 +33,15 @@ from pansplat.system.files import make_unique_name
 
 Vector = tuple[float, float, float]
 
-_SCALE = "scale.txt"
+_SCALE_FILE = "scale.txt"
 _IMAGE_FOLDERS = ("images", "image", "panos", "frames", "input", ".")
 _RIG_SIZE = 1e-3  # distance of cameras of one rig, over the median distance of cameras from their mean
-_ROUNDING, _DIGITS = 1e-5, 1e-9  # of positions in a file, around the cameras and from the origin
-_AGREE = 0.999  # cosine between down axes
-_PANORAMIC = 0.6  # share of the sphere that the pictures of a panorama show; four side faces show two thirds
-_MIN_POINTS = 100  # to find near and far
-_NEAR_QUANTILE, _FAR_QUANTILE, _MARGIN = 0.01, 0.99, 2.0  # of the distances of points; a factor of them
-_BASELINES = (0.2, 20.0)  # near and far over the median distance of a camera to the next one, without points
+_LOCAL_ROUNDING, _FAR_ROUNDING = 1e-5, 1e-9  # rounding: over distances from the mean; from the origin
+_MIN_DOWN_COSINE = 0.999  # least cosine of the angle between the down axes of two pictures that agree
+_MIN_SHOWN_SHARE = 0.6  # share of the sphere that a panorama's pictures show, at least; four side faces show two thirds
+_MIN_POINTS = 100  # points without which near and far are not measured
+_NEAR_QUANTILE, _FAR_QUANTILE, _RANGE_FACTOR = 0.01, 0.99, 2.0  # quantiles of distances of points; a factor
+_BASELINES = (0.2, 20.0)  # without points: near and far, relative to the median distance of a camera to the next one
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def find_picture(folder: Path, name: str, *more: Path) -> Path | None:
     for found in (find_inside(base, part) for part in (name, last) for base in bases):
         if found is not None:
             return found
-    for base in bases:  # a label without a suffix
+    for base in bases:  # the label has no suffix
         found = sorted(base.glob(f"{glob.escape(last)}.*")) if last and base.is_dir() else []
         pictures = [file for file in found if file.suffix.lower() in READABLE_SUFFIXES and file.is_file()]
         if pictures:
@@ -166,12 +166,12 @@ def make_collection(found: Reconstruction) -> Collection:
             stacklevel=4,
         )
     places = dict.fromkeys((found.source.parent, found.folder))
-    scale_file = next((place / _SCALE for place in places if (place / _SCALE).is_file()), None)
+    scale_file = next((place / _SCALE_FILE for place in places if (place / _SCALE_FILE).is_file()), None)
     scale = 1.0 if scale_file is None else read_number(scale_file)
     if scale_file is None and not found.is_metric:
         warnings.warn(
             f"{found.source}: the unit of its poses is arbitrary and is taken as a metre; write metres per unit into "
-            f"{found.folder / _SCALE}.",
+            f"{found.folder / _SCALE_FILE}.",
             InputWarning,
             stacklevel=4,
         )
@@ -196,8 +196,8 @@ def _find_range(
     tree = scipy.spatial.cKDTree(centres)
     if len(points) >= _MIN_POINTS:
         distances = tree.query(points)[0]
-        near = float(np.quantile(distances, _NEAR_QUANTILE)) / _MARGIN
-        far = float(np.quantile(distances, _FAR_QUANTILE)) * _MARGIN
+        near = float(np.quantile(distances, _NEAR_QUANTILE)) / _RANGE_FACTOR
+        far = float(np.quantile(distances, _FAR_QUANTILE)) * _RANGE_FACTOR
         if 0 < 2 * near < far:
             return float(f"{near:.3g}"), float(f"{far:.3g}")
     if is_metric or len(centres) < 2:
@@ -245,7 +245,7 @@ def _join_shots(found: Reconstruction) -> tuple[list[Panorama], dict[str, float]
         else:
             rig, pose = _make_rig(shots)
             coverage = rig.measure_coverage()
-            if coverage < _PANORAMIC:
+            if coverage < _MIN_SHOWN_SHARE:
                 partial |= dict.fromkeys(names, coverage)
                 continue
             name = make_unique_name(_find_common_name(names), taken)
@@ -262,7 +262,7 @@ def _group_by_place(shots: Sequence[Shot]) -> Iterable[list[Shot]]:
     offsets = centres - centres.mean(axis=0)
     spread = float(np.median(np.linalg.norm(offsets, axis=1)))
     local, farthest = (float(np.abs(places).max()) for places in (offsets, centres))
-    tolerance = _RIG_SIZE * spread + _ROUNDING * (1 + local) + _DIGITS * farthest
+    tolerance = _RIG_SIZE * spread + _LOCAL_ROUNDING * (1 + local) + _FAR_ROUNDING * farthest
     flat = np.flatnonzero([shot.lens is not None for shot in shots])
     ends = flat[scipy.spatial.cKDTree(centres[flat]).query_pairs(tolerance, output_type="ndarray")]
     groups: dict[int, list[Shot]] = {}
@@ -278,7 +278,7 @@ def _make_rig(shots: Sequence[Shot]) -> tuple[RigImage, Float[Tensor, "4 4"]]:
     picture that is not vertical.
     """
     poses = torch.stack([shot.cam2world for shot in shots])
-    agree = poses[:, :3, 1] @ poses[:, :3, 1].T > _AGREE
+    agree = poses[:, :3, 1] @ poses[:, :3, 1].T > _MIN_DOWN_COSINE
     most = int(agree.sum(dim=1).argmax())
     down = (poses[agree[most]] if int(agree[most].sum()) > 2 else poses)[:, :3, 1].mean(dim=0)
     down = poses[0, :3, 1] if float(down.norm()) < 0.1 else down / down.norm()

@@ -28,12 +28,12 @@ _T = TypeVar("_T")
 Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Pixels = Annotated[int, Meta(ge=1, le=1 << 20)]
 
-MAX_BYTES = 1 << 24  # of a file that describes a tour
-_MAX_TEXT = 200  # characters of a title or label
-_MAX_NAME = 60  # characters
-_MAX_NOTE, _MAX_HTML = 2_000, 20_000  # characters of a note, and of its HTML
-_MAX_ADDRESSES = 10  # of a note
-_MAX_TILES = 64  # along a face
+MAX_BYTES = 1 << 24  # bytes of the largest file that describes a tour
+_MAX_TEXT = 200  # characters of a title or a label
+_MAX_NAME = 60  # characters of the name of a panorama's file
+_MAX_NOTE, _MAX_HTML = 2_000, 20_000  # characters of a note's text, and of its HTML
+_MAX_ADDRESSES = 10  # addresses that a note may have
+_MAX_TILES = 64  # tiles along one side of a face
 _HIDDEN = ("script", "style", "template")  # elements whose text is not shown
 _BREAKS = ("br", "p", "div", "li", "ul", "ol", "tr", "h1", "h2", "h3", "h4")  # elements on lines of their own
 _ON_THE_WEB = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:|//")
@@ -209,7 +209,7 @@ def make_panoramas(entries: Sequence[Entry], source: Path, tour: str) -> list[Pa
         tour: its title.
     """
     folder = source.parent
-    names: dict[str, str] = {}  # by key
+    names: dict[str, str] = {}  # names of panoramas by their keys
     by_picture: dict[Path | CubeImage, str] = {}
     kept = []
     for number, entry in enumerate(entries, start=1):

@@ -76,7 +76,7 @@ class _Parser:
             if self._peek() == ":":
                 self.position += 1
                 content[key] = self.read_value(depth + 1)
-            else:  # a method, or the short form {name}
+            else:  # this is a method, or the short form {name}
                 self._skip_expression(self.position)
         self.position += 1
         return content

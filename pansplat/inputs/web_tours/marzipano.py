@@ -39,16 +39,16 @@ from pansplat.inputs.web_tours.javascript import parse_literal
 from pansplat.system.strict_json import convert
 
 _DATA = "data.js"
-_FILES = "app-files"  # folder in the archive of the Tool
+_ARCHIVE_FOLDER = "app-files"  # folder in the archive that the Marzipano Tool makes
 _FACES = "frblud"
 _ASSIGNMENT = re.compile(r"(?<![\w$])[A-Za-z_$][\w$]*\s*=\s*(?=\{)")
-_SHOWN = 30  # characters of a file in a message
-_UNNAMED = "Project Title"  # of a project whose author gave no name
+_QUOTED = 30  # characters of a file that a message quotes
+_UNNAMED = "Project Title"  # name of a project whose author gave none
 
 
 def find_marzipano(folder: Path) -> Path | None:
     """The data.js of an export, in the folder or in its app-files/."""
-    found = (folder / _DATA, folder / _FILES / _DATA)
+    found = (folder / _DATA, folder / _ARCHIVE_FOLDER / _DATA)
     return next((path for path in found if path.is_file()), None)
 
 
@@ -71,7 +71,7 @@ def _read_data(source: Path) -> dict[str, Any]:
             return content
     raise InputError(
         f"{source}: needed `var APP_DATA = {{...}}` with a list of scenes, got other text "
-        f"({text.strip()[:_SHOWN]!r}); give the folder of an export of the Marzipano Tool."
+        f"({text.strip()[:_QUOTED]!r}); give the folder of an export of the Marzipano Tool."
     )
 
 

@@ -45,11 +45,11 @@ from pansplat.inputs.web_tours.javascript import parse_literal, skip_space
 from pansplat.system.strict_json import convert
 
 SUFFIXES = (".json", ".html", ".htm", ".js")
-_NAMES = ("tour.json", "pannellum.json", "config.json")  # looked at first
-_OTHERS = ("poses.json", "pairs.json", "links.json", "camera_pose.json")  # files of this package
+_FIRST_NAMES = ("tour.json", "pannellum.json", "config.json")  # these files are read before others
+_OURS = ("poses.json", "pairs.json", "links.json", "camera_pose.json")  # files of pansplat, which are no tours
 _PICTURES = ("panorama", "cubeMap", "multiRes")
 _FACES = "frblud"
-_MAX_LEVEL = 20  # of tiles
+_MAX_LEVEL = 20  # levels of tiles that a picture may have
 _CALL = re.compile(r"pannellum\s*\.\s*viewer\s*\(")
 
 
@@ -59,14 +59,14 @@ def find_pannellum(folder: Path) -> Path | None:
     Raises:
         OSError: the folder cannot be listed.
     """
-    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES and path.name not in _OTHERS]
-    rank = {name: place for place, name in enumerate(_NAMES)}
+    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES and path.name not in _OURS]
+    rank = {name: place for place, name in enumerate(_FIRST_NAMES)}
     files.sort(key=lambda path: (rank.get(path.name, len(rank)), SUFFIXES.index(path.suffix.lower())))
     for path in files:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:
             continue
         try:
-            if path.name == _NAMES[0] or _find_configuration(path) is not None:
+            if path.name == _FIRST_NAMES[0] or _find_configuration(path) is not None:
                 return path
         except InputError:
             continue
@@ -151,13 +151,13 @@ def _read_link(spot: Mapping[str, Any]) -> Link:
 def _read_note(spot: Mapping[str, Any]) -> Note:
     text = spot.get("text")
     picture = [f"[{str(spot['image']).rpartition('/')[2]}]"] if spot.get("image") else []
-    shown = [html.escape(each) for each in (text, *picture) if isinstance(each, str)]  # Pannellum shows no HTML
+    shown = [html.escape(each) for each in (text, *picture) if isinstance(each, str)]  # Pannellum shows HTML as text
     return read_note(_read_direction(spot), shown, [spot.get(name) for name in ("URL", "image", "video")])
 
 
 def _read_direction(content: Mapping[str, Any]) -> tuple[float, float]:
     yaw, pitch = read_direction(content, unit=math.radians(1))
-    return yaw, 0.0 - pitch  # not -0.0
+    return yaw, 0.0 - pitch  # 0.0 instead of the -0.0 of a negation
 
 
 def _base(scene: Mapping[str, Any]) -> list[Any]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
-from pansplat.rendering.cpu import tiling  # tests lower its MAX_INTERSECTIONS
+from pansplat.rendering.cpu import tiling  # a module, because tests lower its MAX_INTERSECTIONS
 from pansplat.rendering.cpu.columns import rasterize_columns
 from pansplat.rendering.cpu.projection import GaussianArrays, project_gaussians
 from pansplat.rendering.cpu.projection_backward import GaussianGradients, accumulate_slots, backpropagate_projection
@@ -67,7 +67,7 @@ def rasterize_planes(
     fields = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.harmonics
     tensors = tuple(field.to(torch.float32).contiguous() for field in fields)
     has_grad = any(tensor.requires_grad for tensor in (*tensors, pose)) and torch.is_grad_enabled()
-    if planes[0].eye_offset and has_grad:  # too rare for kernels of its own
+    if planes[0].eye_offset and has_grad:  # stereo with gradients is too rare for kernels of its own
         return reference.rasterize_planes(gaussians, pose, planes, options)
     sums = _Rasterize.apply(pose, planes, options.near, torch.is_grad_enabled(), *tensors)
     return sums.to(gaussians.means.dtype)
@@ -88,7 +88,7 @@ class _Rasterize(torch.autograd.Function):
         """Sums; `tensors` are the fields of GaussianArrays."""
         gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
         threads, workspace = thread_count(), Workspace()
-        needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad ignores no_grad
+        needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad itself ignores no_grad
         with announce_compilation():
             projected = project_gaussians(gaussians, camera, workspace, threads)
             view = CameraView(gaussians, camera, projected, threads)
@@ -105,7 +105,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # create_graph=True
+        if torch.is_grad_enabled():  # the caller chose create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         *tensors, pose, sums = ctx.saved_tensors
         planes, near, projected, states, _workspace, threads = ctx.saved

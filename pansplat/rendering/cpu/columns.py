@@ -36,9 +36,9 @@ from pansplat.rendering.cpu.tiling import (
 from pansplat.rendering.cpu.view import CameraView
 from pansplat.rendering.image_planes import ImagePlane
 
-_MAX_PAIRS = 1 << 19  # in a strip of columns, unless one tile's width has more: 60 MB of records and values
-_MAX_COLUMNS = 4096  # in a strip, whose folded image is four times as wide
-_MAX_SINE = 0.99  # of the angle between a column and a mean; beyond it every column is tested
+_MAX_PAIRS = 1 << 19  # pairs in a strip of columns, unless one tile's width has more: 60 MB of records and values
+_MAX_COLUMNS = 4096  # columns in a strip, whose folded image is four times as wide
+_MAX_SINE = 0.99  # sine of the angle between a column and a mean, above which every column is tested
 _PARTS_PER_THREAD = 4
 
 
@@ -135,7 +135,7 @@ def _bound_columns(
         kappa = 2 * math.log(max(opacities[g] / ALPHA_CUT, 1.0)) + KAPPA_MARGIN
         reach = 1.001 * math.sqrt(kappa)
         widening = reach * deviation * (radius + offset)
-        largest = math.sqrt(max(covariance[0, 0] + covariance[1, 1] + covariance[2, 2], 0.0))  # or larger
+        largest = math.sqrt(max(covariance[0, 0] + covariance[1, 1] + covariance[2, 2], 0.0))  # an upper bound
         counts[g] = width
         if not horizontal > 1e-9 * radius:
             continue

@@ -44,14 +44,14 @@ NO_LAYER = -1
 
 _PARTS_PER_THREAD = 4
 _SELECTED_AT_ONCE = 1024  # Gaussians; their marks fit the L1 cache
-_AHEAD = 16  # Gaussians between the prefetch of a row and its use
+_PREFETCH_AHEAD = 16  # Gaussians between the prefetch of a row and its use
 _GEOMETRY = 11  # numbers of a row before the harmonics: mean, opacity, quaternion, scales
-_LINE = 16  # float32 per cache line
+_LINE_SIZE = 16  # float32 numbers in a cache line
 _ROWS_PER_ITEM = 16
-# Of a selection that serves several views of a moving camera; wider ones select less often and project more.
+# One selection serves a camera that moves within these margins; wider ones select less often and project more.
 _MARGIN_METRES, _MARGIN_RADIANS = 0.15, 0.06
 _EVEN_BYTES = np.uint32(0x00FF00FF)
-_FRACTION_BITS = 8  # of the weight of a neighbouring pixel
+_FRACTION_BITS = 8  # bits of the weight of a neighbouring pixel, after the binary point
 
 
 class Selection(NamedTuple):
@@ -143,7 +143,7 @@ class DisplayScene:
             report: called with the fraction done; an exception ends the work.
         """
         num, self._num_coefficients = len(means), harmonics.shape[1]
-        size = -(-(_GEOMETRY + 3 * self._num_coefficients) // _LINE) * _LINE
+        size = -(-(_GEOMETRY + 3 * self._num_coefficients) // _LINE_SIZE) * _LINE_SIZE
         self._workspace = Workspace()
         self._rows = self._workspace.array((num, size), np.float32)
         self._balls = np.empty((5, num), np.float32)
@@ -192,6 +192,7 @@ class DisplayScene:
         selection: Selection | None = None,
         cache: SelectionCache | None = None,
         min_transmittance: float = MIN_TRANSMITTANCE,
+        shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> Layers:
         """Rasterise the layers of an image plane.
 
@@ -204,6 +205,7 @@ class DisplayScene:
             selection: leaves out Gaussians that are not in view.
             cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
+            shift: see `project_gaussians`.
         """
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
@@ -223,7 +225,7 @@ class DisplayScene:
                         cache.selected = self._select_around(*of_view)
                     gaussians, ends = cache.selected.gaussians, cache.selected.ends
             with statistics.timed("project"):
-                projected = project_gaussians(gaussians, camera, workspace, threads)
+                projected = project_gaussians(gaussians, camera, workspace, threads, shift)
             start = 0
             for end, layer_sums in zip(ends, sums, strict=True):
                 part = slice(start, end)
@@ -350,8 +352,8 @@ def _copy_marked(
     last = len(marks) - 1
     for g in range(edges[part], edges[part + 1]):
         label = load_scalar(marks, g)
-        if load_scalar(marks, min(g + _AHEAD, last)) >= 0:
-            prefetch(rows, row_size * min(g + _AHEAD, last))
+        if load_scalar(marks, min(g + _PREFETCH_AHEAD, last)) >= 0:
+            prefetch(rows, row_size * min(g + _PREFETCH_AHEAD, last))
         if label >= 0:
             to, row = positions[part, label], row_size * g
             positions[part, label] = to + 1

@@ -17,7 +17,7 @@ from numba.core.typing.templates import ConcreteTemplate as ConcreteTemplate
 from numba.core.typing.templates import infer_global as infer_global
 from numba.core.typing.templates import signature as signature
 
-_OPTIONS = ("no_cfunc_wrapper", "no_cpython_wrapper", "forceinline", "_nrt")  # of njit; they only save time
+_OPTIONS = ("no_cfunc_wrapper", "no_cpython_wrapper", "forceinline", "_nrt")  # options of njit that only save time
 
 
 def _find(owner: Any, path: str) -> Any:

@@ -48,9 +48,9 @@ from pansplat.rendering.cpu.simd import (
 
 GAUSSIAN_BLOCK = 64
 GAUSSIANS_PER_ITEM = 8192
-CULLED = -128.0  # log2_peak of a culled Gaussian
+CULLED = -128.0  # log2_peak that marks a Gaussian as culled
 
-_MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # without the sign
+_MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # the sign is shifted out
 
 # Rows of a block: inputs and results.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 10  # the shape is a quaternion and three scales
@@ -116,16 +116,24 @@ class ProjectedGaussians(NamedTuple):
 
 
 def project_gaussians(
-    gaussians: GaussianArrays, camera: Camera, workspace: Workspace, threads: int
+    gaussians: GaussianArrays,
+    camera: Camera,
+    workspace: Workspace,
+    threads: int,
+    shift: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> ProjectedGaussians:
-    """Project all Gaussians; the arrays belong to the workspace."""
+    """Project all Gaussians; the arrays belong to the workspace.
+
+    Args:
+        shift: of the camera during the exposure, metres, axes of the means: Gaussians blur along it.
+    """
     num = len(gaussians.means)
     records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
     values, kept = workspace.array((num, 4), np.float32), workspace.array(num, np.uint8)
     harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
     work = partial(
-        _project_gaussians, *gaussians, harmonic_bits, *camera, gaussians.view_dependent,
-        records.reshape(-1), values, radii, kept,
+        _project_gaussians, *gaussians, harmonic_bits, *camera, np.array(shift) / math.sqrt(12),
+        gaussians.view_dependent, records.reshape(-1), values, radii, kept,
     )  # fmt: skip
     parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
     return ProjectedGaussians(records, values, radii, kept)
@@ -134,12 +142,12 @@ def project_gaussians(
 @kernel
 def _project_gaussians(
     means, quats, scales, opacities, harmonics, harmonic_bits,
-    pose, filter_variance, near, view_dependent, records, values, radii, kept, item,
+    pose, filter_variance, near, shift, view_dependent, records, values, radii, kept, item,
 ):  # fmt: skip
     align_stack()
     rows, block_kept = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
     basis, soa = np.empty((25, GAUSSIAN_BLOCK), np.float32), np.empty(layout.RECORD_SIZE * LANES, np.float32)
-    camera = pose_columns(pose)
+    camera, motion = pose_columns(pose), (shift[0], shift[1], shift[2])
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
         may_be_invalid = load_block(means, quats, scales, opacities, start, count, rows)
@@ -147,7 +155,7 @@ def _project_gaussians(
         if may_be_invalid:
             _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
         for i in range(0, count, LANES):
-            store_mask(block_kept, i, _compute_records(camera, filter_variance, near, rows, i, soa))
+            store_mask(block_kept, i, _compute_records(camera, motion, filter_variance, near, rows, i, soa))
             soa_to_records(soa, LANES, start + i, min(LANES, count - i), records)
         for i in range(count):
             store_scalar(radii, start + i, rows[RADIUS_ROW, i])
@@ -158,13 +166,14 @@ def _project_gaussians(
 
 
 @inline_kernel
-def _compute_records(pose, filter_variance, near, rows, i, soa):
+def _compute_records(pose, shift, filter_variance, near, rows, i, soa):
     """Write the records of eight Gaussians, a row of `soa` per field; return which are kept."""
     unit, inverse_unit = math.sqrt(layout.HALF_LOG2_E), 1 / math.sqrt(layout.HALF_LOG2_E)
     n, radius, inverse = compute_direction(rows, i, pose)
     store_row(rows, RADIUS_ROW, i, radius)
     u, v, cov, usable = compute_tangent_covariance(rows, i, n, inverse)
-    factors, l_along_a, l_along_b, radial_variance, _, inverse_det = compute_whitening(cov, filter_variance)
+    moved = _add_motion(cov, dot(*u, *shift) * inverse, dot(*v, *shift) * inverse)
+    factors, l_along_a, l_along_b, radial_variance, _, inverse_det = compute_whitening(moved, filter_variance)
     a, b = whitened_axes(u, v, factors)
     store_vector(rows, DIRECTION_ROW, i, n)
     x, y, z = to_axes(pose, n)
@@ -235,7 +244,7 @@ def _validate_harmonics(harmonic_bits, size, start, count, rows):
         prefetch(harmonic_bits, size * (start + PREFETCH_DISTANCE) + j)
     block = harmonic_bits[start * size : (start + count) * size]
     for j in range(block.shape[0]):
-        bits = np.uint32(block[j] << np.uint32(1))  # without the sign
+        bits = np.uint32(block[j] << np.uint32(1))  # this shifts out the sign
         largest = bits if bits > largest else largest
     if largest < _MAX_MAGNITUDE_BITS:
         return
@@ -345,6 +354,16 @@ def _covariance_of_axes(rows, i, u, n, inverse):
         w0 * (u0 * u0 + v0 * v0) + w1 * (u1 * u1 + v1 * v1) + w2 * (u2 * u2 + v2 * v2),
         s0 * w0,
     ), max(max(s0, s1), s2) <= MAX_SCALE_RATIO * MAX_SCALE_RATIO
+
+
+@inline_kernel
+def _add_motion(cov, x, y):
+    """The covariance of Gaussians that move across the ray, by x along u and y along v."""
+    uu, uv, vv, un, vn, nn, det_across, mixed, det = cov
+    xx, xy, yy = x * x, x * y, y * y
+    across = vv * xx - 2 * uv * xy + uu * yy
+    along = (vv * nn - vn * vn) * xx + 2 * (un * vn - uv * nn) * xy + (uu * nn - un * un) * yy
+    return uu + xx, uv + xy, vv + yy, un, vn, nn, det_across + across, mixed + nn * (xx + yy), det + along
 
 
 @inline_kernel

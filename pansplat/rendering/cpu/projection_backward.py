@@ -79,8 +79,8 @@ _POSE_SIZE = 12  # entries of a pose: its rotation and its centre, by rows
 
 # Rows of a block, after those of projection.py. All are gradients.
 _RADIUS_GRAD_ROW = NUM_ROWS
-_MEAN_GRAD_ROW = NUM_ROWS + 1  # of n in world axes, then of the mean
-_SHAPE_GRAD_ROW = NUM_ROWS + 4  # of a quaternion and three scales
+_MEAN_GRAD_ROW = NUM_ROWS + 1  # gradient of n in world axes, then of the mean
+_SHAPE_GRAD_ROW = NUM_ROWS + 4  # gradients of a quaternion and of three scales
 _NUM_ROWS = NUM_ROWS + 11
 
 

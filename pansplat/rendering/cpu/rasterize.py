@@ -59,7 +59,7 @@ BLOCKS_ACROSS = TILE_SIZE // BLOCK_WIDTH
 BLOCKS_DOWN = TILE_SIZE // BLOCK_HEIGHT
 NUM_BLOCKS = BLOCKS_ACROSS * BLOCKS_DOWN
 TILE_PIXELS = TILE_SIZE * TILE_SIZE
-CHUNK_SIZE = 256  # Gaussians
+CHUNK_SIZE = 256  # Gaussians that are marked and composited together
 CHUNK_WORDS = CHUNK_SIZE // 64  # a word has 64 bits, one per Gaussian
 ROW_MASKS = BLOCKS_ACROSS + 1  # index of the first row's mask, after the columns; see `mark_blocks`
 NUM_MASKS = ROW_MASKS + BLOCKS_DOWN + 1  # per word of a chunk
@@ -67,8 +67,8 @@ BUFFER_SIZE = CHUNK_SIZE + 64  # log2 alphas of a block, and up to 64 bytes that
 _SLICE_SIZE = CHUNK_SIZE // NUM_BLOCKS  # Gaussians of the next chunk that each block prefetches
 
 # Rows of a chunk's footprints.
-ROW_A, ROW_B, ROW_L = 0, 2, 4  # two components each
-POINT = 6  # the Gaussian's point: two components
+ROW_A, ROW_B, ROW_L = 0, 2, 4  # first rows of a, b and l, which have two components each
+POINT = 6  # first row of the Gaussian's point, which has two components
 RADIAL_VARIANCE, LOG2_PEAK = 8, 9
 THIRD = 10  # third components of a, b, l and the point; only used in 3d
 FOOTPRINT_SIZE = 14
@@ -76,8 +76,8 @@ FOOTPRINT_SIZE = 14
 LOG2_ALPHA_CUT = math.log2(ALPHA_CUT)
 LOG2_ZERO = -1000.0  # log2 of an alpha that counts as zero
 MIN_TRANSMITTANCE = TRANSMITTANCE_CUT["numba"]  # a pixel is finished at this transmittance or below
-MIN_PLANAR_COSINE = 0.5  # of the angle to the tile's centre; below it footprint rows have three components
-_HORIZON_MARGIN = 0.1  # in log2 alpha
+MIN_PLANAR_COSINE = 0.5  # cosine of the angle to the tile's centre, below which footprint rows have three components
+_HORIZON_MARGIN = 0.1  # log2 alpha by which the test at the horizon is widened
 VALUE_LANES = 4  # values of a Gaussian: RGB and the distance
 TILE_FRAME_SIZE = 15  # see `set_tile_frame`
 
@@ -126,7 +126,7 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
     Returns:
         Whether a pixel is too far from the centre for footprint rows with two components.
     """
-    min_cosine = 1.0  # of the angle from the centre to the farthest pixel, which is in a corner
+    min_cosine = 1.0  # cosine of the angle from the centre to the farthest pixel, which is in a corner
     for corner in range(-1, 4):
         x, y = left + TILE_SIZE // 2, top + TILE_SIZE // 2
         if corner >= 0:
@@ -509,7 +509,7 @@ def _blend_values(block, count, log2_alphas, indices, begin, chunk_values, trans
     transmitted = load(transmittance, pixel)
     sum0, sum1 = load(tile_sums, pixel), load(tile_sums, TILE_PIXELS + pixel)
     sum2, sum3 = load(tile_sums, 2 * TILE_PIXELS + pixel), load(tile_sums, 3 * TILE_PIXELS + pixel)
-    for at in range(begin, begin + count, 2):  # after an odd number the last alpha is 0
+    for at in range(begin, begin + count, 2):  # after an odd number, the alpha that follows is 0
         first = VALUE_LANES * np.int64(load_scalar(indices, at))
         second = VALUE_LANES * np.int64(load_scalar(indices, at + 1))
         alpha = compute_alpha(load(log2_alphas, at * LANES))

@@ -70,11 +70,11 @@ from pansplat.rendering.cpu.tiling import parallel_for_tiles
 
 _MAX_PAIRS = NUM_BLOCKS * CHUNK_SIZE  # pairs of a Gaussian and a block, in a chunk
 _PAIR_SIZE = 2 * LANES  # numbers in a pair: gradients by log alpha, and weights; one cache line
-_NUM_SUMS = 16  # per Gaussian; see `_accumulate_gradient_sums`
+_NUM_SUMS = 16  # numbers for each Gaussian, as `_accumulate_gradient_sums` lists them
 _VALUE_SUMS = 9  # index of the first sum of values
 _LN2 = math.log(2)
-_MIN_DIVISOR = 1e-16  # of L^2 + radial_variance Q; only reached where the gradient is 0
-_WRITE_AHEAD = 24  # Gaussians, from the prefetch of a slot to the write
+_MIN_DIVISOR = 1e-16  # smallest L^2 + radial_variance Q in a division; only reached where the gradient is 0
+_WRITE_AHEAD = 24  # Gaussians between the prefetch of a slot and the write to it
 
 
 def rasterize_backward(
@@ -149,7 +149,7 @@ def _rasterize_tiles_backward(
                 pixels_are_3d = np.int64(is_3d)
             mark_blocks(intersections, first, count, masks)
             next_first = first - CHUNK_SIZE
-            if chunk == 0:  # the last chunk of the next tile
+            if chunk == 0:  # the next chunk is the last one of the next tile
                 next_first = end + CHUNK_SIZE * (saved_num_chunks[min(tile + 1, high - 1)] - 1)
             _backpropagate_chunk(
                 records, values, intersections, next_first, is_3d, footprints, chunk_values, masks, offsets,

@@ -45,7 +45,7 @@ _OPTIONS = {
 _MESSAGE = "pansplat: compiling kernels for this processor; the first run of each command takes 15 to 30 seconds longer"
 _MESSAGE_DELAY = 1.0  # seconds of compilation before the message
 _message_shown = False
-_cache_folder: Path | None = None  # of the kernels; None without a cache
+_cache_folder: Path | None = None  # folder of the compiled kernels; None without a cache
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -145,7 +145,7 @@ def _mark(folder: Path) -> bool:
     except FileExistsError:
         return False
     except OSError:
-        pass  # it cannot be written
+        pass  # a folder that cannot be written has no mark
     return True
 
 
@@ -246,7 +246,7 @@ _lock = threading.Lock()
 _idle: list[npt.NDArray[np.uint8]] = []
 _returned: deque[npt.NDArray[np.uint8]] = (
     deque()
-)  # not yet in `_idle`: a workspace may end while a thread holds the lock
+)  # buffers that are not yet in `_idle`: a workspace may end while a thread holds the lock
 
 
 class Workspace:

@@ -44,16 +44,16 @@ _BYTES, _INTS, _LONGS, _FLOATS, _DOUBLES, _BITS = (
 _FOUR_FLOATS = ir.VectorType(_FLOAT, 4)
 _ELEMENT = object()  # stands for the type of an array's elements
 _VECTOR_TYPES = {"f32x8": _FLOATS, "f64x8": _DOUBLES, "mask": _BITS}
-_ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes, of the elements' type
+_ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes; alignment of each type's elements
 _CACHE_LINE = 64  # bytes
-_F64_FLAGS = ("contract", "nsz")  # as in runtime.py
+_F64_FLAGS = ("contract", "nsz")  # the options of fastmath in runtime.py
 
 # 2^x on [-1/2, 1/2]: least maximum relative error (9.2e-8) among polynomials of degree 5 that are 1 at 0.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472731307149)
 _ROUND_F32 = 1.5 * 2.0**23  # added to a number, it gives the nearest integer in the low bits
 _ROUND_F64 = 1.5 * 2.0**52
 _ROUND_F64_BITS = 0x4338000000000000
-_ROOT_HALF_BITS = 0x3FE6A09E667F3BCD  # of sqrt(1/2)
+_ROOT_HALF_BITS = 0x3FE6A09E667F3BCD  # bits of sqrt(1/2)
 
 
 class _Vector(types.Type):

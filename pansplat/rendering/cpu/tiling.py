@@ -29,7 +29,7 @@ from pansplat.rendering.reference import split_rows
 
 # --- bounding boxes ---
 
-LARGEST_SIDE = 32767  # pixels; boxes are int16
+LARGEST_SIDE = 32767  # pixels of an image's longer side; boxes are int16
 _KAPPA_MARGIN = np.float32(KAPPA_MARGIN)
 _LOG2_ALPHA_CUT = np.float32(math.log2(ALPHA_CUT))
 
@@ -123,7 +123,7 @@ def _is_outside(n, p, q, radial_variance, kappa, normal_x, normal_y, normal_z):
 @kernel
 def _bound_pinhole(records, rotation, height, width, focal, boxes, item):
     rows = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK), np.float32)
-    tan_x, tan_y = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))  # of half the field of view
+    tan_x, tan_y = np.float32(width / (2 * focal)), np.float32(height / (2 * focal))  # tangents of half the field
     middle_x, middle_y, scale = np.float32(0.5 * width), np.float32(0.5 * height), np.float32(focal)
     num = len(records) // layout.RECORD_SIZE
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, num), GAUSSIAN_BLOCK):
@@ -304,10 +304,10 @@ def find_bounding_boxes(records: np.ndarray, plane: ImagePlane, workspace: Works
 # has a slot, and the slots of one Gaussian are contiguous: tiles write gradients without conflicts, and the slots of
 # each Gaussian are summed in a fixed order.
 
-MAX_INTERSECTIONS = 1 << 26  # in one band: 512 MB
+MAX_INTERSECTIONS = 1 << 26  # intersections in a band, which take 512 MB
 _TILE_SHIFT = TILE_SIZE.bit_length() - 1
 _LAST_PIXEL = TILE_SIZE - 1
-_PARTS_PER_THREAD = 4  # of the scene: some cores are slower than others
+_PARTS_PER_THREAD = 4  # parts of a scene for each thread: some cores are slower than others
 _BUFFER_SIZE = 512  # intersections buffered before a write: two small loops are twice as fast as one large loop
 _WRITE_AHEAD = 16  # intersections of a tile between the prefetch of a cache line and the write
 _INT16_MASK = np.int64(0xFFFF)  # a box as one word: x0, x1, y0, y1 from the lowest bits up
@@ -384,7 +384,7 @@ def _count_intersections(ends, words, rows, columns, counts, part):
         word = load_scalar(words, g)
         first, last, top, bottom = _tile_range(word)
         upper, lower = top * across, (bottom + 1 if word != EMPTY_BOX else top) * across
-        if (word >> 16 & _INT16_MASK) < (word & _INT16_MASK):  # wraps around
+        if (word >> 16 & _INT16_MASK) < (word & _INT16_MASK):  # the box wraps around
             if last < first:
                 _add(steps, upper, 1)
                 _add(steps, lower, -1)
@@ -533,13 +533,13 @@ def intersect_tiles(
 # the same distance, a radix sort by all digits replaces it; its time does not depend on the distances.
 
 _MAX_DIGIT_BITS = 11  # 2048 counters fit the L1 cache
-_EXTRA_BITS = 3  # of a digit, beyond half the bits of an index in the tile, so that few intersections stay out of order
+_EXTRA_BITS = 3  # bits of a digit beyond half those of an index in the tile: few intersections stay out of order
 _MAX_MOVES = 4  # average moves of an intersection by insertion before radix sort replaces it
 _READ_AHEAD = 32  # intersections between the prefetch of a distance and its use
 _ROUNDING_BITS = 12  # lowest bits of a distance, ignored: equal distances, computed in other steps, may differ in these
 _SIGN_MASK = np.int64(0x7FFFFFFFFFFFFFFF)
 _ITEMS_PER_THREAD = 8
-_EMPTY_TILE_COST = 32  # in intersections
+_EMPTY_TILE_COST = 32  # cost of a tile without intersections, in intersections
 
 
 @inline_kernel

@@ -78,8 +78,8 @@ from pansplat.rendering.cpu.tiling import (
 from pansplat.rendering.cpu.view import make_camera
 from pansplat.rendering.image_planes import image_planes
 
-MAX_BAND_INTERSECTIONS = 1 << 18  # up to 10 million pairs: 0.3 GB
-MAX_STORED_PAIRS = 1 << 24  # 0.6 GB
+MAX_BAND_INTERSECTIONS = 1 << 18  # intersections in a band: up to 10 million pairs, which take 0.3 GB
+MAX_STORED_PAIRS = 1 << 24  # pairs whose weights are kept, which take 0.6 GB
 
 
 class _Pairs(NamedTuple):

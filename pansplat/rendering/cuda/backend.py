@@ -42,7 +42,7 @@ def rasterize_planes(
     """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`."""
     device = gaussians.means.device
     _check_device(device)
-    if planes[0].eye_offset:  # too rare for kernels of their own
+    if planes[0].eye_offset:  # stereo is too rare for kernels of its own
         return reference.rasterize_planes(gaussians, pose, planes, options)
     # Triton launches on torch's current device, not on that of its arguments.
     with torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext():
@@ -196,7 +196,7 @@ class _Composite(torch.autograd.Function):
         kept = []
         for band in intersect_tiles(instances):
             stops = rasterize(records, band, pixels, sums, layout)
-            if grad_enabled and any(ctx.needs_input_grad):  # needs_input_grad ignores no_grad
+            if grad_enabled and any(ctx.needs_input_grad):  # needs_input_grad itself ignores no_grad
                 kept.append((band, stops))
         ctx.save_for_backward(records, rows, sums)
         ctx.setup, ctx.kept = setup, kept
@@ -206,7 +206,7 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         from pansplat.rendering.cuda.rasterize import rasterize_backward, sum_by_record, unpack_gradients
 
-        if torch.is_grad_enabled():  # create_graph=True
+        if torch.is_grad_enabled():  # the caller chose create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         records, rows, sums = ctx.saved_tensors
         instances, pixels, layout, _ = ctx.setup

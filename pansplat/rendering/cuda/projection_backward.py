@@ -93,7 +93,7 @@ def backpropagate_quats(grad_axes, quats, index, mask):
     norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     safe = tl.where(norm > 0, norm, 1.0)
     w, x, y, z = quat[0] / safe, quat[1] / safe, quat[2] / safe, quat[3] / safe
-    one, two, three = grad_axes[0], grad_axes[1], grad_axes[2]  # columns
+    one, two, three = grad_axes[0], grad_axes[1], grad_axes[2]  # columns of the gradient of the axes' matrix
     grad_w = 2 * (z * (one[1] - two[0]) + y * (three[0] - one[2]) + x * (two[2] - three[1]))
     xy, xz, yz = two[0] + one[1], three[0] + one[2], three[1] + two[2]
     grad_x = 2 * (y * xy + z * xz + w * (two[2] - three[1]) - 2 * x * (two[1] + three[2]))

@@ -321,7 +321,7 @@ def rasterize_backward_kernel(
         grad_peak = tl.where((alpha > 0) & (raw <= _MAX_ALPHA), grad_alpha * falloff, 0.0)
         grad_q = -0.5 * record[PEAK] * grad_peak
         if AXES == 3:
-            grad_square = grad_q / divisor  # of q = Q / divisor with a fixed divisor
+            grad_square = grad_q / divisor  # gradient of q = Q / divisor, for a fixed divisor
             grad_divisor = -grad_square * (square / divisor)
             bounded = tl.maximum(ahead, TINY)
             grad_ahead = tl.where(ahead >= TINY, 2 * bounded * grad_divisor, 0.0)

@@ -24,7 +24,7 @@ _MAX_INTERSECTIONS = 1 << 24
 _MAX_TILES = 1 << 15
 """Tiles in a band: their indices are sorted as 16-bit integers, in half the passes of 32."""
 
-_BLOCK_SIZE: tl.constexpr = tl.constexpr(512)  # intersections of one program
+_BLOCK_SIZE: tl.constexpr = tl.constexpr(512)  # intersections that one program processes
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def sort_instances(
     records, ranges, counts = [], [], []
     order = last = None
     for plane, (box, key, base) in enumerate(zip(boxes, keys, bases, strict=True)):
-        if order is None or key is not last:  # sorted by distance, all planes share one order
+        if order is None or key is not last:  # planes that sort by distance share one order
             order, last = torch.argsort(key, stable=True), key
         touched = tile_ranges(box, size, wraps, TILE_SIZE).int()
         touched[:, 2] += plane * rows
@@ -99,7 +99,7 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
     """List the intersections of all tiles, in bands of tile rows with at most `limit` intersections (or one row)."""
     rows, columns = instances.grid
     num_columns, first_row, num_rows = instances.ranges.long()[:, 1:].unbind(1)
-    most = max(1, _MAX_TILES // columns)  # rows in a band
+    most = max(1, _MAX_TILES // columns)
     total = int((num_columns * num_rows).sum())
     bands = [(0, rows, total)]
     if total > limit or rows > most:

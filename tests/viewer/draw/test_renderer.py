@@ -11,6 +11,7 @@ from refusals import expect_error
 
 from pansplat.geometry.cubemap import face_poses
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.pose import quats_from_rotations, rotations_from_quats
 from pansplat.rendering import blend, blend_weights, rasterize
 from pansplat_viewer.draw.programs import Programs
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
@@ -21,6 +22,28 @@ pytestmark = pytest.mark.gl
 SIZE = (64, 48)
 SETTINGS = DrawSettings(background=(0.1, 0.4, 0.7))
 RENDERERS = pytest.mark.parametrize("renderer_name", ["gl", "cpu"])
+
+
+def blur(scene, pose, shift):
+    """The scene with Gaussians that are widened by the movement of a camera, in float64."""
+    means, quats, scales = (
+        each.double() for each in (scene.gaussians.means, scene.gaussians.quats, scene.gaussians.scales)
+    )
+    rays = means - torch.from_numpy(pose[:3, 3])
+    n = torch.nn.functional.normalize(rays, dim=1)
+    axes = rotations_from_quats(quats) * scales[:, None]
+    motion = (n * (n @ torch.tensor(shift).double())[:, None] - torch.tensor(shift).double()) / math.sqrt(12)
+    across = torch.eye(3) - n[:, :, None] * n[:, None]
+    before, after = axes @ axes.mT, axes @ axes.mT + motion[:, :, None] * motion[:, None]
+    area = [torch.linalg.det(across @ each @ across + n[:, :, None] * n[:, None]) for each in (before, after)]
+    variances, vectors = torch.linalg.eigh(after)
+    vectors = vectors * torch.linalg.det(vectors).sign()[:, None, None]
+    fields = {
+        "quats": quats_from_rotations(vectors).float(),
+        "scales": variances.clamp_min(0).sqrt().float(),
+        "opacities": scene.gaussians.opacities * (area[0] / area[1]).sqrt().float(),
+    }
+    return change(scene, **fields)
 
 
 def select(scene, mask):
@@ -67,6 +90,9 @@ def make_cases(name, random_scene, pose):
         unusual = opacities * 4 - 1
         unusual[::7] = 0.99 / 255
         yield change(scene, opacities=unusual), pose, SIZE, {}
+    elif name == "a moving camera":
+        for shift in ((0.3, 0.0, 0.2), (0.0, 0.02, -0.1)):
+            yield scene, pose, SIZE, {"shift": shift, "near": 0.5}, blur(scene, pose, shift)
     elif name == "the Gaussians of a view and of levels":
         for view in (0, 1):
             yield scene, pose, SIZE, {"mode": "view", "view": view}, select_view(scene, view)
@@ -90,7 +116,7 @@ def make_cases(name, random_scene, pose):
     [
         *("pinhole", "six faces", "panorama", "among large Gaussians", "smaller than a pixel, needles and discs"),
         *("colours of any degree follow the position", "ties are drawn in the order of indices"),
-        *("near, odd sizes and unusual opacities", "the Gaussians of a view and of levels"),
+        *("near, odd sizes and unusual opacities", "a moving camera", "the Gaussians of a view and of levels"),
         "values that are not finite are dropped",
     ],
 )
