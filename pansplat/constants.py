@@ -1,4 +1,4 @@
-"""Numbers that every renderer must share: torch, numba and Triton read them, and GLSL gets them as defines.
+"""Numbers that renderers and cameras share. GLSL gets them as defines, web pages in their header.
 
 Source: docs/rendering.md.
 """
@@ -24,5 +24,7 @@ MAX_SCALE_RATIO = 1e12  # scale over distance; beyond it the products of docs/re
 MIN_COMPENSATION = 1e-12  # least det B / det B'; it keeps the root differentiable, and below it alpha is always cut
 MIN_EWA_VARIANCE = 1e-12  # pixel^2; the determinant of a needle can round to zero or less
 
-MIN_FOV_DEGREES, MAX_FOV_DEGREES = 15.0, 130.0
-"""Vertical fields of view of cameras that a user moves."""
+# Cameras that a user moves.
+MIN_FOV_DEGREES, MAX_FOV_DEGREES = 15.0, 130.0  # vertical
+MAX_PITCH_DEGREES = 89.9
+WALK_SPEED, FAST = 1.0, 4.0  # metres per second; the factor while Shift is held

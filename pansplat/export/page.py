@@ -33,7 +33,15 @@ from pansplat import constants, pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.doll_house import DollHouse, make_house
 from pansplat.export.film import FilmPhotographs
-from pansplat.export.page_data import MAX_DEGREE, PackedGaussians, PageHeader, count_bytes, pack_gaussians
+from pansplat.export.page_data import (
+    BATCH,
+    MAX_DEGREE,
+    PackedGaussians,
+    PageConstants,
+    PageHeader,
+    count_bytes,
+    pack_gaussians,
+)
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_files, pack_photographs
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
@@ -69,12 +77,9 @@ _PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _START_FOV = 75.0  # degrees, vertical, of a landscape image
-_TALLEST = 1.5  # height of a portrait image relative to it; the poster has this height
-_POSTER_SIZE = (810, 960)  # height and width, pixels
+_POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
 _NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "size": (1.0, 1.0), "places": ()}
-_SPEED = 0.3  # walking, fraction of the reach a second
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
-_BATCH = 256  # quads that are drawn together
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 _SHADERS |= {"photograph": ("screen.vert", "photograph.frag"), "house": ("house.vert", "house.frag")}
@@ -378,7 +383,7 @@ def _choose_degree(scene: Scene, num_bytes: float) -> int:
 
 def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[Pair]) -> bytes:
     """A JPEG of the first view of the page; at a panorama it shows the photograph, if there is one."""
-    fov = math.degrees(2 * math.atan(_TALLEST * math.tan(math.radians(_START_FOV / 2))))
+    fov = math.degrees(2 * math.atan(PageConstants().tallest * math.tan(math.radians(_START_FOV / 2))))
 
     def draw() -> Float[np.ndarray, "height width 3"]:
         options = {"size": _POSTER_SIZE, "layout": "pinhole", "vertical_fov_degrees": fov}
@@ -422,9 +427,8 @@ def _describe_scene(
             "hasStart": tour.panoramas[view].start is not None,
             "hidden": facts.hidden[view],
             "clearances": facts.clearances[view].round(2).tolist(),
-            "radius": round(0.12 * height, 6),
         }
-        for view, (name, position, mark, height) in enumerate(zip(scene.names, positions, marks, heights, strict=True))
+        for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True))
     ]
     reaches = _measure_reaches(scene, np.array(flights.parts))
     views_of_page = [
@@ -451,16 +455,10 @@ def _describe_scene(
         "groups": flights.groups,
         "edges": flights.edges,
         "hysteresis": flights.hysteresis,
-        "reach": REACH,
         "next": flights.next,
         "poor": tour.poor,
         "walk": flights.walk,
-        "batch": _BATCH,
-        "near": constants.NEAR,
         "unit": 1 / scene.frame.unit,
-        "tallest": _TALLEST,
-        "filterVariance": constants.FILTER_VARIANCE,
-        "speed": _SPEED * float(np.median(reaches)),
         "limits": _limit_parts(reaches, positions, flights, flown),
     }
 
@@ -701,4 +699,4 @@ def _read(name: str) -> str:
 
 
 def _load_shader(name: str) -> str:
-    return load_shader(name, "300 es", LAYER_STORAGE=0, BATCH=_BATCH)
+    return load_shader(name, "300 es", LAYER_STORAGE=0, BATCH=BATCH)

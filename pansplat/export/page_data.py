@@ -17,12 +17,19 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pansplat import constants
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.morton import morton_codes
+from pansplat.geometry.pose import AHEAD_EXPONENT
 from pansplat.system.files import SOFTWARE
+from pansplat.tours import route
+from pansplat.tours.graph import CLEARANCE, POOR_REACH
+from pansplat.tours.layout import REACH
+from pansplat.tours.links import RING_DISTANCE, RING_RADIUS
 
 MAX_DEGREE = 3  # of the harmonics of a page
+BATCH = 256  # quads that are drawn together
 _CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
 _MORTON_BITS = 10  # of each coordinate
 _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
@@ -53,7 +60,7 @@ class PageNote(_Record):
 
 
 class PageSpot(_Record):
-    """A panorama: its camera, the mark and the radius of its ring on the floor, and where there is something to see.
+    """A panorama: its camera, the mark of its ring on the floor, and where there is something to see.
 
     Attributes:
         ahead: yaw and pitch of its start view, else of the widest one, radians.
@@ -65,7 +72,6 @@ class PageSpot(_Record):
     name: str
     position: Vector
     mark: Vector
-    radius: float
     notes: tuple[PageNote, ...]
     ahead: tuple[float, float]
     has_start: bool
@@ -130,18 +136,52 @@ class PageHouse(_Record):
     corners: tuple[tuple[float, float, float, float, float], ...]
 
 
-class PageHeader(_Record):
+class PageConstants(_Record, kw_only=True):
+    """Numbers that the page shares with the window and films; the modules that own them say what they are. Angles are
+    in radians, fields of view in degrees."""
+
+    ahead: float = AHEAD_EXPONENT
+    batch: int = BATCH
+    near: float = constants.NEAR
+    filter_variance: float = constants.FILTER_VARIANCE
+    tallest: float = 1.5  # height of a portrait image relative to a landscape one
+    min_fov: float = constants.MIN_FOV_DEGREES
+    max_fov: float = constants.MAX_FOV_DEGREES
+    max_pitch: float = math.radians(constants.MAX_PITCH_DEGREES)
+    speed: float = constants.WALK_SPEED
+    fast: float = constants.FAST
+    clearance: float = CLEARANCE
+    poor_reach: float = POOR_REACH
+    reach: float = REACH
+    ring_radius: float = RING_RADIUS
+    ring_distance: float = RING_DISTANCE
+    fade_seconds: float = route.FADE_SECONDS
+    stop_reach: float = route.STOP_REACH
+    stop_seconds: float = route.STOP_SECONDS
+    rest_seconds: float = route.REST_SECONDS
+    turn_seconds: float = route.TURN_SECONDS
+    turn_angle: float = math.radians(route.TURN_DEGREES)
+    zoom_seconds: float = route.ZOOM_SECONDS
+    zoom: float = route.ZOOM
+    lowest_pitch: float = route.LOWEST_PITCH
+    flight_seconds: tuple[float, float] = route.FLIGHT_SECONDS
+    short_flight: float = route.SHORT_FLIGHT
+    metre_seconds: float = route.METRE_SECONDS
+    covered: float = route.COVERED
+    surfaces: float = route.SURFACES
+    most_beside: float = route.MOST_BESIDE
+
+
+class PageHeader(PageConstants, kw_only=True):
     """All numbers of a page but those of single Gaussians.
 
     Attributes:
         count, degree, color_range, harmonics_scale: of the Gaussians (`PackedGaussians`).
         loading: views in the order of their data.
         level: axes of a level camera (columns right, down, forward).
-        parts, groups, edges, hysteresis, reach, next, poor: the graph of the tour (graph.js).
+        parts, groups, edges, hysteresis, next, poor: the graph of the tour (graph.js).
         walk: the panoramas in the order of a visit of all.
-        batch, near, filter_variance, tallest: of the picture.
         unit: of a metre in the page.
-        speed: of a walk, a second.
         limits: how far the camera may go in each part; 0 where it stands at photographs, and there are no Gaussians.
         folder: address of the folder with the files; None of a page in one file.
     """
@@ -160,16 +200,10 @@ class PageHeader(_Record):
     groups: tuple[tuple[int, ...], ...]
     edges: tuple[tuple[int, int, int], ...]
     hysteresis: float
-    reach: float
     next: tuple[tuple[int, ...], ...]
     poor: tuple[tuple[int, int], ...]
     walk: tuple[int, ...]
-    batch: int
-    near: float
     unit: float
-    tallest: float
-    filter_variance: float
-    speed: float
     limits: tuple[float, ...]
     doll: tuple[PageHouse, ...]
     photographs: tuple[PagePhotograph, ...]

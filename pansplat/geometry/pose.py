@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_AHEAD_EXPONENT = 0.55  # exponent of the weight of a view straight ahead (docs/rendering.md, section 7)
+AHEAD_EXPONENT = 0.55  # exponent of the weight of a view straight ahead (docs/rendering.md, section 7)
 
 
 def rotations_from_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -134,5 +134,5 @@ def blend_weights(
     divisors = torch.where(is_at_position, torch.ones_like(distances), distances)
     closeness = torch.where(is_at_position, torch.ones_like(distances), nearest / divisors)
     if forward is not None:
-        closeness = closeness * torch.exp(_AHEAD_EXPONENT * ((positions - position) @ forward.to(distances) / divisors))
+        closeness = closeness * torch.exp(AHEAD_EXPONENT * ((positions - position) @ forward.to(distances) / divisors))
     return closeness / closeness.sum()

@@ -12,6 +12,8 @@ from pansplat.inputs.pairs import Link
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.outlook import find_bin
 
+RING_RADIUS = 0.22  # metres, on the floor
+RING_DISTANCE = 0.66  # metres from the camera, within which a panorama has no ring
 _NEAREST_METRES = 1.0  # of a link's ring
 _WALL_METRES = 3.0  # usual distance of a wall
 _MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical

@@ -24,16 +24,16 @@ NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not d
 STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
 STOP_SECONDS = 0.2  # of the fade between scene and photograph
 REST_SECONDS = 3.0  # at each panorama of a flight through a tour
-_TURN_SECONDS, _TURN_DEGREES = 0.4, 45.0  # of a turn by this angle or more; smaller ones are shorter
-_ZOOM_SECONDS = 0.7
+TURN_SECONDS, TURN_DEGREES = 0.4, 45.0  # of a turn by this angle or more; smaller ones are shorter
+ZOOM_SECONDS = 0.7
 _END_SECONDS = 0.1  # at the end of a zoom, so that a route ends in the scene of its last panorama
-_ZOOM = 2 / 3  # of the field of view, at the end of a zoom
-_LOWEST = -0.2  # radians, the pitch towards a link, which may be on the floor
-_FLIGHT_SECONDS = 1.0, 1.6  # the least and the most of a flight
-_SHORT, _METRE_SECONDS = 2.0, 0.1  # metres of a flight of the least time, and seconds for each further metre
+ZOOM = 2 / 3  # of the field of view, at the end of a zoom
+LOWEST_PITCH = -0.2  # radians, the pitch towards a link, which may be on the floor
+FLIGHT_SECONDS = 1.0, 1.6  # the least and the most of a flight
+SHORT_FLIGHT, METRE_SECONDS = 2.0, 0.1  # metres of a flight of the least time, and seconds for each further metre
 _NEAR = 1.0  # metres to the first panorama, below which the camera keeps its heading
-_COVERED = 0.1  # of a flight, from either end: there is the photograph, which fades over as much
-_SURFACES, _MOST_BESIDE = 2.5, 0.4  # usual distance of surfaces, metres, and the most of it from a photograph's camera
+COVERED = 0.1  # of a flight, from either end: there is the photograph, which fades over as much
+SURFACES, MOST_BESIDE = 2.5, 0.4  # usual distance of surfaces, metres, and the most of it from a photograph's camera
 
 Kind = Literal["turn", "flight", "zoom", "rest"]
 
@@ -82,7 +82,7 @@ class Moment:
     @property
     def narrowing(self) -> float:
         """Field of view of the photograph that a zoom begins with, as a fraction of the camera's."""
-        return 1 - (1 - _ZOOM) * self.zoom
+        return 1 - (1 - ZOOM) * self.zoom
 
     @property
     def arrived(self) -> float:
@@ -134,7 +134,7 @@ class Route:
             return Moment(step, self._pose(step.start), step.nodes[0], 1.0, self._pose(step.end), part)
         pose = self._pose((1 - part) * step.start + part * step.end)
         end, away = (0, part) if part < 0.5 else (1, 1 - part)
-        weight = min(max(2 - away / _COVERED, 0.0), 1.0) if step.kind == "flight" else 1.0
+        weight = min(max(2 - away / COVERED, 0.0), 1.0) if step.kind == "flight" else 1.0
         return Moment(step, pose, step.nodes[end], weight if step.nodes[end] is not None else 0.0)
 
     def pose(self, fraction: float) -> Float[np.ndarray, "4 4"]:
@@ -221,16 +221,16 @@ class _Planner:
         """Turn to a yaw and pitch; a small angle takes less time."""
         yaw, pitch = self.camera[3:] if view is None else view
         across = wrap_angle(yaw - self.camera[3])
-        part = min(math.hypot(across, pitch - self.camera[4]) / math.radians(_TURN_DEGREES), 1.0)
+        part = min(math.hypot(across, pitch - self.camera[4]) / math.radians(TURN_DEGREES), 1.0)
         if part > 1e-6:
-            self.add("turn", (*self.camera[:3], self.camera[3] + across, pitch), part * _TURN_SECONDS)
+            self.add("turn", (*self.camera[:3], self.camera[3] + across, pitch), part * TURN_SECONDS)
 
     def go(self, node: int, after: Sequence[int]) -> None:
         """Go to a panorama, after which another one may follow."""
         before = self.node
         if before is not None and self.tour.is_fade(before, node):
             self.turn(self.find_way(before, node))
-            self.add("zoom", (*self.places[node], *self.find_arrival(before, node)), _ZOOM_SECONDS, node)
+            self.add("zoom", (*self.places[node], *self.find_arrival(before, node)), ZOOM_SECONDS, node)
         elif before != node:
             edge = None if before is None else (min(before, node), max(before, node))
             self.edge = edge if edge in self.tour.overlaps else self.edge
@@ -243,13 +243,13 @@ class _Planner:
     def fly(self, node: int) -> None:
         """Turn to a panorama and fly there; straight up or down, and from near its place, the heading stays."""
         right, down, forward = away = self.places[node] - self.camera[:3]
-        length, (seconds, longest) = float(np.linalg.norm(away)), _FLIGHT_SECONDS
+        length, (seconds, longest) = float(np.linalg.norm(away)), FLIGHT_SECONDS
         if self.node is None and length < _NEAR:
-            seconds = _TURN_SECONDS
+            seconds = TURN_SECONDS
         else:
             is_level = math.hypot(right, forward) > abs(down) / 10
             self.turn((math.atan2(right, forward) if is_level else self.camera[3], 0.0))
-            seconds = min(max(seconds + _METRE_SECONDS * (length - _SHORT), seconds), longest)
+            seconds = min(max(seconds + METRE_SECONDS * (length - SHORT_FLIGHT), seconds), longest)
         self.add("flight", (*self.places[node], *self.camera[3:]), seconds, node)
 
     def find_way(self, start: int, end: int) -> tuple[float, float] | None:
@@ -257,7 +257,7 @@ class _Planner:
         link, away = self.tour.find_direction(start, end), self.places[end] - self.places[start]
         if link is not None and self.tour.is_fade(start, end):
             yaw, pitch = find_angles(self.level.T @ link)
-            return yaw, max(pitch, _LOWEST)
+            return yaw, max(pitch, LOWEST_PITCH)
         return (math.atan2(away[0], away[2]), 0.0) if self.tour.worlds[start] == self.tour.worlds[end] else None
 
     def find_arrival(self, start: int, end: int) -> Sequence[float]:
@@ -283,8 +283,8 @@ def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
 
 def find_offset(pose: Float[np.ndarray, "4 4"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """From a panorama to a camera beside it, in its axes, as a fraction of the usual distance of surfaces."""
-    offset = pose[:3, :3].T @ (position - pose[:3, 3]) / _SURFACES
-    return offset * min(_MOST_BESIDE / max(float(np.linalg.norm(offset)), 1e-9), 1.0)
+    offset = pose[:3, :3].T @ (position - pose[:3, 3]) / SURFACES
+    return offset * min(MOST_BESIDE / max(float(np.linalg.norm(offset)), 1e-9), 1.0)
 
 
 def ease(fraction: float) -> float:

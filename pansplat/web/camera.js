@@ -2,14 +2,10 @@
 // OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world, moved by its
 // origin. Matrices are arrays of rows.
 
-import {
-  clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled,
-} from "./graph.js";
+import { clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
-export const MAX_PITCH = 89.9 * DEGREE;
-export const MIN_FOV = 20, MAX_FOV = 110;  // degrees, vertical
-const SOFT = 0.3;                   // of the way to the limit of the camera, in which steps become shorter
+const SOFT = 0.3; // of the way to the limit of the camera, in which steps become shorter
 
 // Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
 export function rotationOf({ yaw, pitch, roll }) {
@@ -29,7 +25,7 @@ export const tangentOf = (width, height, fov = camera.fov) => tallOf(width, heig
 
 export function turn(yaw, pitch) {
   camera.yaw += yaw;
-  camera.pitch = clamp(camera.pitch + pitch, -MAX_PITCH, MAX_PITCH);
+  camera.pitch = clamp(camera.pitch + pitch, -HEADER.maxPitch, HEADER.maxPitch);
   changed();
 }
 
@@ -81,8 +77,8 @@ export function cameraFor({ position, yaw, pitch, fov }) {
   }
   check("angles", [yaw, pitch, fov].filter((value) => value !== undefined));
   if (yaw !== undefined) found.yaw = yaw * DEGREE;
-  if (pitch !== undefined) found.pitch = clamp(pitch * DEGREE, -MAX_PITCH, MAX_PITCH);
-  if (fov !== undefined) found.fov = clamp(fov, MIN_FOV, MAX_FOV);
+  if (pitch !== undefined) found.pitch = clamp(pitch * DEGREE, -HEADER.maxPitch, HEADER.maxPitch);
+  if (fov !== undefined) found.fov = clamp(fov, HEADER.minFov, HEADER.maxFov);
   return found;
 }
 
@@ -96,10 +92,7 @@ export function floorPoint(position) {
   return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
 }
 
-const AHEAD = 0.55;                 // exponent of the weight of a view straight ahead
-const MIN_WEIGHT = 1e-4;            // of a view: with it, the other views fill the holes of a view at its own camera
-export const FADE_MS = 1000;               // from the views of one edge to those of the next, and from part to part
-export const ZOOM_MS = 700;
+const MIN_WEIGHT = 1e-4; // of a view: with it, the other views fill the holes of a view at its own camera
 
 // Weights of the views of a group in a picture of a position and a direction: blend_weights of pansplat. Other views
 // have weight 0.
@@ -109,10 +102,10 @@ function groupWeights(group, position, forward) {
   const nearest = Math.min(...distances);
   const closeness = views.map((view, i) => {
     const ahead = dot(minus(HEADER.views[view].position, position), forward) / (distances[i] || 1);
-    return (distances[i] > 0 ? nearest / distances[i] : 1) * Math.exp(AHEAD * ahead);
+    return (distances[i] > 0 ? nearest / distances[i] : 1) * Math.exp(HEADER.ahead * ahead);
   });
   const sum = closeness.reduce((a, b) => a + b);
-  views.forEach((view, i) => { weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT); });
+  for (const [i, view] of views.entries()) weights[view] = Math.max(closeness[i] / sum, MIN_WEIGHT);
   return weights;
 }
 
@@ -127,9 +120,9 @@ export function blendWeights({ position, rotation }) {
 // The views that are sorted fade in.
 export function showViews(step) {
   const { sorted } = state;
-  if (!sorted || !sorted.views.some((view) => shown[view] < 1)) return;
+  if (!sorted?.views.some((view) => shown[view] < 1)) return;
   const isFirst = !sorted.views.some((view) => shown[view] && HEADER.views[view].count);
-  sorted.views.forEach((view) => { shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1); });
+  for (const view of sorted.views) shown[view] = isFirst ? 1 : Math.min(shown[view] + step, 1);
   changed();
 }
 
@@ -137,7 +130,7 @@ export function showViews(step) {
 export function updateEdge(now) {
   const { fade } = state;
   if (fade) {
-    const t = clamp((now - fade.began) / FADE_MS, 0, 1);
+    const t = clamp((now - fade.began) / (1000 * HEADER.fadeSeconds), 0, 1);
     fade.done = ease(t);
     if (t === 1) state.fade = null;
     changed();

@@ -1,10 +1,9 @@
 // What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
 
-import { clamp, column, distanceOf, dot, minus } from "./graph.js";
+import { column, distanceOf, dot, minus } from "./graph.js";
 import { edges, GRAPH, parts } from "./state.js";
 
-const LEVEL_WAY = 0.1;    // metres, of a way whose heading is known
-const LOWEST_WAY = -0.2;  // radians, of a picture that shows a way
+const LEVEL_WAY = 0.1; // metres, of a way whose heading is known
 
 const isFlown = (from, to) => {
   return edges.length ? edges.some(([a, b]) => (a === from && b === to) || (a === to && b === from)) : parts[from] === parts[to];
@@ -45,7 +44,7 @@ export function headingTo(position, from) {
 // of a place that is known; null where it is unknown.
 export function findHeading(from, to) {
   const link = findLink(from, to), { worlds } = HEADER.plan;
-  if (link) return { yaw: link.yaw, pitch: Math.max(link.pitch, LOWEST_WAY) };
+  if (link) return { yaw: link.yaw, pitch: Math.max(link.pitch, HEADER.lowestPitch) };
   return worlds[from] === worlds[to] ? headingTo(GRAPH.positions[to], GRAPH.positions[from]) : null;
 }
 

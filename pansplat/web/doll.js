@@ -1,15 +1,15 @@
 // The doll's house view: the camera turns around the rooms from outside, and no wall is drawn that shows its back. docs/web.md
 // describes it.
 
-import { MAX_PITCH, tangentOf, turned } from "./camera.js";
+import { tangentOf, turned } from "./camera.js";
 import { clamp, column, cross, DEGREE, distanceOf, dot, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { camera, changed, state } from "./state.js";
 
-const DOLL_FOV = 45;                               // degrees, vertical, of a landscape picture
-const DOLL_PITCH = -45 * DEGREE;                   // of the first view
-const LOWEST = -8 * DEGREE;                        // pitch of a camera that looks along the floor
-const DOLL_ZOOM = [0.15, 2];                       // of the distance from which all rooms are in the picture
-const DOLL_TURN = Math.PI / 2;                     // radians a second, by keys
+const DOLL_FOV = 45; // degrees, vertical, of a landscape picture
+const DOLL_PITCH = -45 * DEGREE; // of the first view
+const LOWEST = -8 * DEGREE; // pitch of a camera that looks along the floor
+const DOLL_ZOOM = [0.15, 2]; // of the distance from which all rooms are in the picture
+const DOLL_TURN = Math.PI / 2; // radians a second, by keys
 
 // The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
 export const findHouse = (node = state.doll.node) => HEADER.doll.find(({ nodes }) => nodes.includes(node));
@@ -30,7 +30,7 @@ export function frameDoll(size) {
   Object.assign(camera, { position: place, yaw: camera.yaw + turn });
   const places = findHouse().corners.map((place) => [0, 1, 2].map((k) => dot(column(HEADER.level, k), place)));
   const box = ["min", "max"].map((end) => [0, 1, 2].map((k) => places.reduce((found, place) => Math[end](found, place[k]), places[0][k])));
-  const yaws = [camera.yaw, camera.yaw + 0.5 * Math.PI];  // the one that is nearer to the rooms
+  const yaws = [camera.yaw, camera.yaw + 0.5 * Math.PI]; // the one that is nearer to the rooms
   const middle = scaled(plus(...box), 0.5), offsets = places.map((place) => minus(place, middle));
   const distances = yaws.map((yaw) => fit(offsets, yaw, DOLL_PITCH, size)), best = Number(distances[1] < 0.95 * distances[0]);
   const center = HEADER.level.map((row) => dot(row, middle));
@@ -64,7 +64,7 @@ function placeOutside(yaw, pitch) {
 export function orbit(yaw, pitch) {
   if (state.doll.flight) return;
   camera.yaw += yaw;
-  camera.pitch = clamp(camera.pitch + pitch, -MAX_PITCH, LOWEST);
+  camera.pitch = clamp(camera.pitch + pitch, -HEADER.maxPitch, LOWEST);
   camera.position = placeOutside(camera.yaw, camera.pitch);
   changed();
 }
@@ -84,7 +84,8 @@ export function zoomDoll(factor) {
 }
 
 // The keys that walk: sideways and up turn, forward comes nearer.
-export function orbitByKeys([right, up, forward], seconds) {
+export function orbitByKeys(step, seconds) {
+  const [right, up, forward] = step;
   if (right || up) orbit(-DOLL_TURN * seconds * right, -0.5 * DOLL_TURN * seconds * up);
   if (forward) zoomDoll(Math.exp(-seconds * forward));
 }
@@ -99,7 +100,7 @@ export function meetHouse(origin, ray, { corners } = findHouse()) {
   let nearest = null;
   for (let first = 0; first < corners.length; first += 3) {
     const [a, b, c] = corners.slice(first, first + 3), normal = cross(minus(b, a), minus(c, a)), toward = dot(normal, ray);
-    if (toward <= 0 || Math.max(a[3], a[4]) > 1) continue;  // from behind, and the tops of walls
+    if (toward <= 0 || Math.max(a[3], a[4]) > 1) continue; // from behind, and the tops of walls
     const distance = dot(normal, minus(a, origin)) / toward, place = plus(origin, scaled(ray, distance));
     const isInside = [[a, b], [b, c], [c, a]].every(([from, to]) => dot(cross(minus(to, from), minus(place, from)), normal) >= 0);
     if (isInside && distance > 0 && (nearest === null || distance < nearest)) nearest = distance;

@@ -1,6 +1,8 @@
 // The document: elements, short messages, and the motion that a visitor prefers.
 
+/** @type {(id: string) => any} */
 export const byId = (id) => document.getElementById(id);
+/** @type {HTMLCanvasElement & { ariaBusy: any }} */
 export const canvas = byId("view");
 export const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
@@ -9,7 +11,9 @@ let spoken = null;
 export function say(text) {
   byId("status").textContent = text;
   clearTimeout(spoken);
-  spoken = setTimeout(() => { byId("status").textContent = ""; }, 5000);
+  spoken = setTimeout(() => {
+    byId("status").textContent = "";
+  }, 5000);
 }
 
 export function explain(text, links = []) {
@@ -31,7 +35,7 @@ export function make(tag, className, ...children) {
   return element;
 }
 
-const MAX_PIXELS = 3e6;             // of the canvas: limits the memory of its render targets
+const MAX_PIXELS = 3e6; // of the canvas: limits the memory of its render targets
 
 // Of the canvas at the full resolution.
 export function fullSize() {

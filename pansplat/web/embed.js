@@ -3,8 +3,8 @@
 class Embed {
   constructor() {
     this.isFramed = window.parent !== window;
-    this.isEngaged = !this.isFramed;  // whether the wheel and vertical strokes of a finger are the page's
-    this.waiting = null;              // for the end of a goTo
+    this.isEngaged = !this.isFramed; // whether the wheel and vertical strokes of a finger are the page's
+    this.waiting = null; // for the end of a goTo
     this.at = null;
   }
 
@@ -14,20 +14,22 @@ class Embed {
     if (!this.isFramed) return;
     const engage = (value) => {
       this.isEngaged = value;
-      surfaces.forEach(({ style }) => { style.touchAction = value ? "none" : "pan-y"; });
+      for (const { style } of surfaces) style.touchAction = value ? "none" : "pan-y";
     };
     engage(false);
     addEventListener("click", () => engage(true));
-    addEventListener("keydown", (event) => { if (event.code === "Escape") engage(false); });
+    addEventListener("keydown", ({ code }) => code === "Escape" && engage(false));
     addEventListener("blur", () => engage(false));
-    document.documentElement.addEventListener("pointerleave", ({ pointerType }) => { if (pointerType === "mouse") engage(false); });
+    document.documentElement.addEventListener("pointerleave", ({ pointerType }) => pointerType === "mouse" && engage(false));
   }
 
   // A promise of whether the camera arrives at the panorama; `go` starts the way to it.
   await(node, go) {
     if (this.waiting) this.waiting.resolve(false);
     go();
-    return new Promise((resolve) => { this.waiting = { node, resolve }; });
+    return new Promise((resolve) => {
+      this.waiting = { node, resolve };
+    });
   }
 
   // In every frame: the panorama at a camera that has arrived, or null.

@@ -1,22 +1,19 @@
 // Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump fades:
 // the image of the camera before covers the new one until that is there, then it fades out; that of a zoom grows.
 
-import { cameraFor, FADE_MS, isFixed, nearestNode, nodeHere, settleAt, turn, ZOOM_MS } from "./camera.js";
+import { cameraFor, isFixed, nearestNode, nodeHere, settleAt, turn } from "./camera.js";
 import { chooseArrival, findHeading, headingTo } from "./choices.js";
 import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit, placeInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isFade, minus, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
-import { photographs, STANDS } from "./photographs.js";
+import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
-import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, parts, state } from "./state.js";
+import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, state } from "./state.js";
 
-const DOLL_SECONDS = 1.6;            // of a flight out of the rooms, or into one
-const TURN_SECONDS = 0.4, WHOLE_TURN = 45 * DEGREE;  // of a turn at a photograph; a smaller one is shorter
-const ZOOM = 2 / 3;                 // of the field of view, at the end of a zoom
-const MAX_STILL = 8e6;              // pixels of its image
-const NEAR = HEADER.speed;          // metres: a second's walk
-export const PHOTO_WAIT_MS = 2000;  // for a photograph, at most: where a zoom ends, and of the first Gaussians
-const REST_SECONDS = 3;             // at a panorama, on a tour
+const DOLL_SECONDS = 1.6; // of a flight out of the rooms, or into one
+const MAX_STILL = 8e6; // pixels of its image
+const NEAR = HEADER.speed; // metres: a second's walk
+export const PHOTO_WAIT_MS = 2000; // for a photograph, at most: where a zoom ends, and of the first Gaussians
 
 export function jump(position, { yaw, pitch }, isZoom = false) {
   takeStill(isZoom);
@@ -24,7 +21,7 @@ export function jump(position, { yaw, pitch }, isZoom = false) {
 }
 
 function place(pose) {
-  if (state.doll.isOn) setDoll(false);  // before the pose, which may have a field of view
+  if (state.doll.isOn) setDoll(false); // before the pose, which may have a field of view
   Object.assign(camera, pose);
   state.headset.turnTo(camera.yaw);
   settleAt(camera.position);
@@ -132,7 +129,7 @@ export function flyTo(spot) {
   }
   const { legs, end } = planWay(spot);
   state.flight = { spot, legs: calm.matches ? [{ to: spot, view: end }] : legs, began: null };
-  if (state.isTouring) state.flight.legs.push({ rest: REST_SECONDS });
+  if (state.isTouring) state.flight.legs.push({ rest: HEADER.restSeconds });
   changed();
 }
 
@@ -140,12 +137,12 @@ export function flyTo(spot) {
 function planWay(spot) {
   const part = edges.length ? partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)) : 0;
   const way = edges.length ? findWay(GRAPH, camera.position, spot, part) : [spot];
-  const here = nodeHere(), isThere = distanceOf(camera.position, GRAPH.positions[here]) <= STANDS;
+  const here = nodeHere(), isThere = distanceOf(camera.position, GRAPH.positions[here]) <= HEADER.stopReach;
   const legs = [];
   let from = isThere ? here : null, position = [...camera.position], end = chooseArrival(spot, camera);
   way.forEach((node, i) => {
     const before = i > 0 ? way[i - 1] : null, isZoom = before !== null && isFade(GRAPH, before, node);
-    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node);  // a zoom begins where the camera is
+    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node); // a zoom begins where the camera is
     if (node === from || isLeft) return;
     const heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || camera;
     if (heading) legs.push({ view: { yaw: heading.yaw, pitch: heading.pitch } });
@@ -164,7 +161,7 @@ export function advanceFlight(now) {
   if (flight.began === null) beginLeg(leg, now);
   const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1, step = ease(t) - leg.done;
   leg.done = ease(t);
-  if (leg.turn) turn(leg.turn[0] * step, leg.turn[1] * step);  // a drag adds to it
+  if (leg.turn) turn(leg.turn[0] * step, leg.turn[1] * step); // a drag adds to it
   if (leg.path) camera.position = t < 1 ? plus(leg.path[0], scaled(minus(leg.path[1], leg.path[0]), leg.done)) : [...leg.path[1]];
   if (leg.path) changed();
   if (t < 1) return;
@@ -172,7 +169,7 @@ export function advanceFlight(now) {
   flight.began = null;
   flight.legs.shift();
   if (flight.legs.length) {
-    if (!leg.seconds && leg.to === undefined) advanceFlight(now);  // a zoom begins with the picture at rest, which has the full resolution
+    if (!leg.seconds && leg.to === undefined) advanceFlight(now); // a zoom begins with the picture at rest, which has the full resolution
     return;
   }
   state.flight = null;
@@ -185,16 +182,17 @@ function beginLeg(leg, now) {
   state.flight.began = now;
   leg.done = 0;
   leg.seconds = leg.rest || 0;
-  if (leg.path) leg.seconds = clamp(1 + 0.1 * (distanceOf(...leg.path) - 2), 1, 1.6);
-  else if (leg.view && leg.to === undefined && !state.headset.session) {  // the head turns itself
+  const [least, most] = HEADER.flightSeconds;
+  if (leg.path) leg.seconds = clamp(least + HEADER.metreSeconds * (distanceOf(...leg.path) - HEADER.shortFlight), least, most);
+  else if (leg.view && leg.to === undefined && !state.headset.session) { // the head turns itself
     const { yaw, pitch } = leg.view, across = yaw - camera.yaw;
     leg.turn = [Math.atan2(Math.sin(across), Math.cos(across)), pitch - camera.pitch];
-    leg.seconds = TURN_SECONDS * Math.min(Math.hypot(...leg.turn) / WHOLE_TURN, 1);
+    leg.seconds = HEADER.turnSeconds * Math.min(Math.hypot(...leg.turn) / HEADER.turnAngle, 1);
   }
 }
 
 export function setTouring(value) {
-  if (state.doll.isDue) setDoll(false);  // another way replaces it
+  if (state.doll.isDue) setDoll(false); // another way replaces it
   state.isTouring = value && HEADER.spots.length > 1;
   if (state.isTouring && state.doll.isOn) jump(GRAPH.positions[state.doll.node], state.doll.heading);
   byId("play").setAttribute("aria-pressed", state.isTouring);
@@ -237,12 +235,12 @@ const stillCanvas = byId("still");
 // That of a zoom is large enough to grow.
 export function takeStill(isZoom = false) {
   if (!state.renderer || !state.sorted) return;
-  const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * ZOOM * camera.fov * DEGREE) : 1;
+  const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * HEADER.zoom * camera.fov * DEGREE) : 1;
   state.still = { taken: null, began: null, left: 1, position: null, isZoom, zoom };
-  if (state.headset.session) return;  // it fades from black
+  if (state.headset.session) return; // it fades from black
   const full = fullSize(), larger = photographs.isOpaque ? Math.max(Math.min(zoom, Math.sqrt(MAX_STILL / (full[0] * full[1]))), 1) : 1;
   const size = full.map((side) => Math.round(side * larger)), isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
-  drawAt(...(photographs.isOpaque || isZoom ? size : [canvas.width, canvas.height]));  // it can be copied in the task that drew it
+  drawAt(...(photographs.isOpaque || isZoom ? size : [canvas.width, canvas.height])); // it can be copied in the task that drew it
   const context = stillCanvas.getContext("2d");
   context.globalAlpha = stillCanvas.hidden || !isSame ? 1 : 1 - Number(stillCanvas.style.opacity);
   if (!isSame) [stillCanvas.width, stillCanvas.height] = size;
@@ -258,7 +256,7 @@ export function updateStill(now) {
   still.position ??= [...camera.position];
   if (still.began === null && isUncovered(now)) still.began = now;
   if (still.began !== null) {
-    const t = clamp((now - still.began) / (still.isZoom ? ZOOM_MS : FADE_MS), 0, 1);
+    const t = clamp((now - still.began) / (1000 * (still.isZoom ? HEADER.zoomSeconds : HEADER.fadeSeconds)), 0, 1);
     still.left = 1 - ease(t);
     if (t === 1) state.still = null;
   }

@@ -7,11 +7,10 @@
 // Edges are numbers in `edges`.
 
 export const DEGREE = Math.PI / 180;
-const CLEARANCE = 0.25;  // metres before a surface, at which a walk ends
-const POOR_REACH = 0.5;  // metres that a camera may walk from a panorama along a poor edge, at most a quarter of it
 
 export const minus = (a, b) => a.map((value, i) => value - b[i]);
 export const plus = (a, b) => a.map((value, i) => value + b[i]);
+/** @type {(a: number[], factor: number) => any} */
 export const scaled = (a, factor) => a.map((value) => value * factor);
 export const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 export const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
@@ -67,12 +66,12 @@ function measureFree(graph, edge, place) {
   const nodes = edge === null ? [...graph.positions.keys()] : graph.edges[edge].slice(0, 2);
   const found = nodes.filter((node) => graph.clearances[node].length).map((node) => {
     const offset = minus(place, graph.positions[node]), distance = Math.hypot(...offset);
-    const free = Math.max(findClearance(graph, node, offset) - distance - CLEARANCE, CLEARANCE - distance);
+    const free = Math.max(findClearance(graph, node, offset) - distance - HEADER.clearance, HEADER.clearance - distance);
     return [free, scaled(offset, 1 / Math.max(distance, 1e-9))];
   });
   if (!found.length) return [Infinity, [0, 0, 0]];
   const [free, away] = found.reduce((best, each) => each[0] > best[0] ? each : best);
-  const beside = edge === null || isPoor(graph, edge) ? -Infinity : CLEARANCE - distanceToEdge(graph, edge, place);
+  const beside = edge === null || isPoor(graph, edge) ? -Infinity : HEADER.clearance - distanceToEdge(graph, edge, place);
   return [Math.max(free, beside), away];
 }
 
@@ -86,7 +85,7 @@ function findClearance(graph, node, offset) {
 // _limit_along
 function limitAlong(graph, edge, start, end, part) {
   const [first, last] = graph.edges[edge].slice(0, 2).map((node) => graph.positions[node]);
-  const length = Math.max(distanceOf(first, last), 1e-9), along = scaled(minus(last, first), 1 / length), reach = Math.min(POOR_REACH, length / 4);
+  const length = Math.max(distanceOf(first, last), 1e-9), along = scaled(minus(last, first), 1 / length), reach = Math.min(HEADER.poorReach, length / 4);
   const depthOf = (place) => {
     const walked = dot(minus(place, first), along);
     return Math.min(walked, length - walked);
@@ -106,7 +105,7 @@ export const isFade = (graph, from, to) => {
 // find_way
 export function findWay(graph, position, node, part = null) {
   const ends = graph.edges[nearestEdge(graph, position, part)].slice(0, 2), [from, to] = ends.map((end) => distanceOf(graph.positions[end], position));
-  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1];  // no camera flies to the other end
+  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1]; // no camera flies to the other end
   const ways = ends.map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);

@@ -4,7 +4,7 @@ import { findHouse } from "./doll.js";
 import { byId } from "./dom.js";
 import { state } from "./state.js";
 
-const houses = new WeakMap();       // what each renderer needs
+const houses = new WeakMap(); // what each renderer needs
 
 function makeHouse(renderer) {
   const { gl } = renderer, triangles = gl.createVertexArray(), atlas = gl.createTexture();
@@ -18,7 +18,7 @@ function makeHouse(renderer) {
   renderer.bind([atlas]);
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, byId("atlas"));
   gl.generateMipmap(gl.TEXTURE_2D);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LOD, 3);  // the margins of the textures are as wide
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LOD, 3); // the margins of the textures are as wide
   const sharper = gl.getExtension("EXT_texture_filter_anisotropic");
   if (sharper) gl.texParameteri(gl.TEXTURE_2D, sharper.TEXTURE_MAX_ANISOTROPY_EXT, 8);
   return { triangles, atlas, ...renderer.link(SHADERS.house) };

@@ -1,6 +1,6 @@
 // Keys, pointers, the wheel, the device's motion, and buttons.
 
-import { MAX_FOV, MAX_PITCH, MIN_FOV, tangentOf, turn, walk } from "./camera.js";
+import { tangentOf, turn, walk } from "./camera.js";
 import { orbit, resizeDoll, zoomDoll } from "./doll.js";
 import { byId, canvas, say, showMore } from "./dom.js";
 import { embed } from "./embed.js";
@@ -12,12 +12,20 @@ import { openList } from "./rings.js";
 import { copyLink, parsePose, savePicture } from "./share.js";
 import { camera, changed, state } from "./state.js";
 
-const DRAG = 5;  // pixels; a click moves by less
+const DRAG = 5; // pixels; a click moves by less
 const held = new Set(), fingers = new Map();
-let pressed;  // where the pointer went down; null when it has moved
+let pressed; // where the pointer went down; null when it has moved
 const MOVES = {
-  KeyW: [0, 0, 1], ArrowUp: [0, 0, 1], KeyS: [0, 0, -1], ArrowDown: [0, 0, -1], KeyA: [-1, 0, 0], ArrowLeft: [-1, 0, 0],
-  KeyD: [1, 0, 0], ArrowRight: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0],
+  KeyW: [0, 0, 1],
+  ArrowUp: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  ArrowDown: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  ArrowLeft: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  ArrowRight: [1, 0, 0],
+  KeyE: [0, 1, 0],
+  KeyQ: [0, -1, 0],
 };
 const PRESSES = {
   Space: () => setTouring(!state.isTouring),
@@ -25,17 +33,18 @@ const PRESSES = {
   KeyR: () => goHome(),
   KeyH: () => byId("keys").showModal(),
   KeyL: () => openList(),
-  KeyM: () => { if (HEADER.spots.length > 1) plan.toggle(); },
+  KeyM: () => HEADER.spots.length > 1 && plan.toggle(),
   KeyO: () => toggleDoll(),
   KeyP: () => savePicture(),
 };
-const CLOSES = { KeyH: "keys", KeyL: "list" };  // the dialogs that a key opens and closes
+const CLOSES = { KeyH: "keys", KeyL: "list" }; // the dialogs that a key opens and closes
 
 function onHeld() {
   state.step = [0, 1, 2].map((k) => [...held].reduce((sum, code) => sum + MOVES[code][k], 0));
 }
 
 function onKey(event) {
+  /** @type {HTMLDialogElement} */
   const open = document.querySelector("dialog[open]");
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   if (open) {
@@ -51,15 +60,15 @@ function onKey(event) {
   if (event.code === "Enter" && event.target === canvas && measure.isOn) measure.take(0.5 * innerWidth, 0.5 * innerHeight);
   const onButton = event.target.tagName === "BUTTON" && (event.code === "Space" || event.code === "Enter");
   if (onButton) return;
-  const digit = /^(Digit|Numpad)([1-9])$/.exec(event.code);
+  const spot = Number(/^(?:Digit|Numpad)([1-9])$/.exec(event.code)?.[1]) - 1;
   if (MOVES[event.code]) {
     held.add(event.code);
     onHeld();
   }
   else if (PRESSES[event.code] && !event.repeat) PRESSES[event.code]();
-  else if (digit && HEADER.spots[digit[2] - 1]) {
+  else if (HEADER.spots[spot]) {
     setTouring(false);
-    flyTo(digit[2] - 1);
+    flyTo(spot);
   }
   else return;
   event.preventDefault();
@@ -75,7 +84,7 @@ function onMove(event) {
   if (pressed && distanceOf(pressed, [event.clientX, event.clientY]) >= DRAG) {
     pressed = null;
     canvas.setPointerCapture(event.pointerId);
-    canvas.focus({ preventScroll: true });  // not a ring
+    canvas.focus({ preventScroll: true }); // not a ring
   }
   const before = [...fingers.values()];
   fingers.set(event.pointerId, [event.clientX, event.clientY]);
@@ -99,10 +108,10 @@ function onWheel(event) {
     return;
   }
   event.preventDefault();
-  const pixels = event.deltaY * (event.deltaMode ? 33 : 1);  // or lines
+  const pixels = event.deltaY * (event.deltaMode ? 33 : 1); // or lines
   const factor = Math.exp(0.001 * clamp(pixels, -200, 200));
   if (state.doll.isOn) zoomDoll(factor);
-  else camera.fov = clamp(camera.fov * factor, MIN_FOV, MAX_FOV);
+  else camera.fov = clamp(camera.fov * factor, HEADER.minFov, HEADER.maxFov);
   changed();
 }
 
@@ -112,10 +121,9 @@ function onOrientation({ alpha, beta, gamma }) {
   if (alpha === null || beta === null || gamma === null || state.doll.isOn) return;
   const [ca, sa, cb, sb, cg, sg] = [alpha, beta, gamma].map((degrees) => degrees * DEGREE)
     .flatMap((angle) => [Math.cos(angle), Math.sin(angle)]);
-  const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]],
-    multiply([[1, 0, 0], [0, cb, -sb], [0, sb, cb]], [[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]]));
+  const toEarth = multiply([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]], multiply([[1, 0, 0], [0, cb, -sb], [0, sb, cb]], [[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]]));
   const angle = (screen.orientation ? screen.orientation.angle : 0) * DEGREE;
-  const inLevel = (axis) => {  // x east, y down, z north
+  const inLevel = (axis) => { // x east, y down, z north
     const [east, north, up] = toEarth.map((row) => dot(row, axis));
     return [east, -up, north];
   };
@@ -124,9 +132,9 @@ function onOrientation({ alpha, beta, gamma }) {
   const across = [Math.cos(yaw), 0, -Math.sin(yaw)];
   const down = [Math.sin(yaw) * Math.sin(pitch), Math.cos(pitch), Math.cos(yaw) * Math.sin(pitch)];
   if (motion.last === null) motion.last = yaw;
-  camera.yaw += yaw - motion.last;  // so that a drag can turn the camera, too
+  camera.yaw += yaw - motion.last; // so that a drag can turn the camera, too
   motion.last = yaw;
-  camera.pitch = clamp(pitch, -MAX_PITCH, MAX_PITCH);
+  camera.pitch = clamp(pitch, -HEADER.maxPitch, HEADER.maxPitch);
   camera.roll = Math.atan2(dot(right, down), dot(right, across));
   changed();
 }
@@ -137,7 +145,7 @@ async function toggleMotion() {
     motion = null;
     camera.roll = 0;
   } else {
-    const ask = DeviceOrientationEvent.requestPermission;  // iOS only
+    const ask = /** @type {any} */ (DeviceOrientationEvent).requestPermission; // iOS only
     if (ask && await ask.call(DeviceOrientationEvent) !== "granted") return;
     motion = { last: null };
     addEventListener("deviceorientation", onOrientation);
@@ -154,7 +162,9 @@ function toggleFull() {
 
 export function listen() {
   addEventListener("keydown", onKey);
-  addEventListener("keydown", (event) => { state.isFast = event.shiftKey; });
+  addEventListener("keydown", (event) => {
+    state.isFast = event.shiftKey;
+  });
   addEventListener("keyup", (event) => {
     state.isFast = event.shiftKey;
     held.delete(event.code);
@@ -172,8 +182,8 @@ export function listen() {
     const pose = parsePose(location.hash);
     if (pose) setPose(pose);
   });
-  addEventListener("pointerdown", (event) => { if (!byId("more").parentElement.contains(event.target)) showMore(false); });
-  for (const surface of [canvas, byId("spots")]) {  // rings are over the canvas
+  addEventListener("pointerdown", (event) => byId("more").parentElement.contains(event.target) || showMore(false));
+  for (const surface of [canvas, byId("spots")]) { // rings are over the canvas
     surface.addEventListener("pointerdown", (event) => {
       if (surface === canvas) canvas.setPointerCapture(event.pointerId);
       pressed = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
@@ -184,8 +194,9 @@ export function listen() {
     surface.addEventListener("wheel", onWheel, { passive: false });
     surface.addEventListener("contextmenu", (event) => event.preventDefault());
   }
-  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, (event) => fingers.delete(event.pointerId));
-  byId("spots").addEventListener("click", (event) => { if (event.detail && pressed === null) event.stopPropagation(); }, true);
+  addEventListener("pointerup", (event) => fingers.delete(event.pointerId));
+  addEventListener("pointercancel", (event) => fingers.delete(event.pointerId));
+  byId("spots").addEventListener("click", (event) => event.detail && pressed === null && event.stopPropagation(), true);
   canvas.addEventListener("click", ({ clientX, clientY }) => {
     if (!pressed) return;
     if (measure.isOn) measure.take(clientX, clientY);
@@ -194,13 +205,15 @@ export function listen() {
   byId("play").onclick = () => setTouring(!state.isTouring);
   byId("home").onclick = goHome;
   byId("place").onclick = openList;
-  byId("list").onclick = (event) => { if (event.target === byId("list")) byId("list").close(); };  // beside it
+  byId("list").onclick = (event) => {
+    if (event.target === byId("list")) byId("list").close();
+  }; // beside it
   byId("map").onclick = () => plan.toggle();
   byId("doll").onclick = toggleDoll;
   byId("doll").hidden = !HEADER.doll.length;
   byId("no-doll").hidden = HEADER.doll.length > 0;
   byId("more").onclick = () => showMore(byId("menu").hidden);
-  for (const [id, act] of [["measure", () => measure.toggle()], ["full", toggleFull], ["picture", savePicture], ["link", copyLink]]) {
+  for (const [id, act] of Object.entries({ measure: () => measure.toggle(), full: toggleFull, picture: savePicture, link: copyLink })) {
     byId(id).onclick = () => {
       showMore(false);
       act();

@@ -106,6 +106,7 @@ function onSorted(data) {
 }
 
 // Starts the worker; `onView` gets the Gaussians of each view. Returns a promise of the first order.
+/** @type {(onView: (data: any) => void) => Promise<void>} */
 export function load(onView) {
   return new Promise((resolve, reject) => {
     fails = (error) => state.sorted ? fail(error) : reject(error);

@@ -1,7 +1,7 @@
 // Frames. One is drawn only if something changed. While the picture moves, the scale of its resolution follows the time
 // between frames; at rest it has the full resolution.
 
-import { FADE_MS, nodeHere, showViews, tangentOf, updateEdge, walk } from "./camera.js";
+import { nodeHere, showViews, tangentOf, updateEdge, walk } from "./camera.js";
 import { orbitByKeys } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { embed } from "./embed.js";
@@ -16,20 +16,21 @@ import { plan } from "./plan.js";
 import { placeRings, showPlace } from "./rings.js";
 import { camera, currentPart, edges, GRAPH, isComplete, isSortedFor, shown, state } from "./state.js";
 
-const SLOW_MS = 45, FAST_MS = 25;   // of a frame: above, the resolution falls; below, it rises
-const PAUSE_MS = 1000;              // a longer frame is not measured
-const REST_MS = 200;                // after a change, until the full resolution is drawn
-export const SORT_DISTANCE = 0.01;  // metres from the point for which a headset's Gaussians are sorted
-const LEAST_SCALE = 0.25;           // of the resolution
-const EXPOSURE_MS = 1000 / 30;      // of a frame of a flight, at most, by which its Gaussians blur
-const scales = [1, 1];              // of the resolution while it moves: of Gaussians, and of photographs
+const SLOW_MS = 45, FAST_MS = 25; // of a frame: above, the resolution falls; below, it rises
+const PAUSE_MS = 1000; // a longer frame is not measured
+const REST_MS = 200; // after a change, until the full resolution is drawn
+export const SORT_DISTANCE = 0.01; // metres from the point for which a headset's Gaussians are sorted
+const LEAST_SCALE = 0.25; // of the resolution
+const EXPOSURE_MS = 1000 / 30; // of a frame of a flight, at most, by which its Gaussians blur
+const scales = [1, 1]; // of the resolution while it moves: of Gaussians, and of photographs
 let lastFrame = 0;
 
 // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
 export function isSettled() {
   const isDrawn = state.headset.session !== null || !state.isDirty && state.drawnScale === 1, tolerance = state.headset.session ? SORT_DISTANCE : 0;
   const isMoving = state.doll.isDue || [state.flight, state.doll.flight, state.fade, state.still].some((each) => each !== null);
-  return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) && state.sorted.views.every((view) => shown[view] === 1);
+  return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) &&
+    state.sorted.views.every((view) => shown[view] === 1);
 }
 
 // Moves what moves by itself, `seconds` after the last time.
@@ -37,23 +38,23 @@ export function advance(now, seconds) {
   advanceFlight(now);
   advanceDollFlight(now);
   if (edges.length && !state.doll.isOn) updateEdge(now);
-  showViews(1000 * seconds / FADE_MS);
+  showViews(seconds / HEADER.fadeSeconds);
   photographs.update(seconds);
   updateStill(now);
   loadAround();
   const node = nodeHere(), isMoving = state.flight !== null || state.doll.flight !== null || isWaiting();
-  const isThere = !isMoving && !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.spots[node].radius;
+  const isThere = !isMoving && !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.ringRadius;
   embed.follow(isThere ? node : null, isMoving);
 }
 
 export function onFrame(now) {
   requestAnimationFrame(onFrame);
-  if (state.headset.session) return;  // it has frames of its own
+  if (state.headset.session) return; // it has frames of its own
   const elapsed = now - lastFrame, seconds = Math.min(elapsed, 100) / 1000;
   const before = [...camera.position];
   lastFrame = now;
   if (state.doll.isOn) orbitByKeys(state.step, seconds);
-  else if (state.step.some((value) => value)) walk(...scaled(state.step, seconds * HEADER.speed * (state.isFast ? 3 : 1)));
+  else if (state.step.some((value) => value)) walk(...scaled(state.step, seconds * HEADER.speed * (state.isFast ? HEADER.fast : 1)));
   advance(now, seconds);
   if (state.sorted) requestSort();
   const moving = now - state.lastChange < REST_MS;

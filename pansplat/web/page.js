@@ -17,8 +17,9 @@ import { parsePose, poseOf } from "./share.js";
 import { camera, changed, currentPart, isComplete, isSortedFor, redraw, shown, state } from "./state.js";
 import { headset } from "./xr.js";
 
-const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later";  // that have all that the page uses
-const FROM_DISK = "Browsers read this folder only from a web server. Upload it, or show it with pansplat export --serve. A page that opens from disk is a file: export to a name that ends in .html.";
+const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later"; // that have all that the page uses
+const FROM_DISK =
+  "Browsers read this folder only from a web server. Upload it, or show it with pansplat export --serve. A page that opens from disk is a file: export to a name that ends in .html.";
 const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
 
 // The poster has the scale and the place of the picture that follows.
@@ -45,13 +46,13 @@ async function main() {
   if (linked) Object.assign(camera, cameraFor(linked));
   settleAt(camera.position);
   canvas.ariaBusy = true;
-  const received = [];  // kept for a context that is lost
+  const received = []; // kept for a context that is lost
   const loading = load((data) => {
     received.push(data);
     if (state.renderer) state.renderer.add(data);
     if (isComplete()) canvas.ariaBusy = false;
   });
-  loading.catch(() => {});  // of an error that comes before it is awaited
+  loading.catch(() => {}); // of an error that comes before it is awaited
   const gl = canvas.getContext("webgl2", { alpha: false, powerPreference: "high-performance" });
   if (!gl) throw lack("WebGL 2");
   headset.gl = gl;
@@ -61,19 +62,32 @@ async function main() {
     received.forEach((data) => made.add(data));
     setRenderer(made);
   };
-  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); setRenderer(null); headset.lose(); });
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault();
+    setRenderer(null);
+    headset.lose();
+  });
   canvas.addEventListener("webglcontextrestored", () => {
-    try { makeRenderer(); } catch (error) { fail(error); }
+    try {
+      makeRenderer();
+    } catch (error) {
+      fail(error);
+    }
   });
   makeRenderer();
-  while (!state.renderer) {  // the context is lost
+  while (!state.renderer) { // the context is lost
     if (failure) throw failure;
     await wait(50);
   }
   let isLoaded = false, isLate = false;
-  loading.then(() => { isLoaded = true; }, () => { isLoaded = true; });
-  wait(PHOTO_WAIT_MS).then(() => { isLate = true; });
-  while (!isLoaded && !photographs.isOpaque) {  // it can be looked at before the Gaussians arrive
+  const finish = () => {
+    isLoaded = true;
+  };
+  loading.then(finish, finish);
+  wait(PHOTO_WAIT_MS).then(() => {
+    isLate = true;
+  });
+  while (!isLoaded && !photographs.isOpaque) { // it can be looked at before the Gaussians arrive
     if (isLate || !photographs.isExpected) loadAround();
     photographs.update(1);
     await wait(5);
@@ -90,7 +104,9 @@ async function main() {
   embed.listen([canvas, byId("spots")], window.pansplat);
   onFrame(performance.now());
   byId("cover").className = "done";
-  setTimeout(() => { byId("cover").hidden = !failure; }, 700);
+  setTimeout(() => {
+    byId("cover").hidden = !failure;
+  }, 700);
 }
 
 // A panorama by its number in the list, from 1, or its name.
@@ -113,7 +129,7 @@ window.pansplat = Object.assign(new EventTarget(), {
     return embed.await(node, () => jump ? jumpTo(node) : flyTo(node));
   },
   async render(width, height) {
-    await this.ready;
+    await window.pansplat.ready;
     const place = [...camera.position];
     settleAt(place);
     loadAround();
@@ -123,7 +139,7 @@ window.pansplat = Object.assign(new EventTarget(), {
       photographs.update(1, [width, height]);
     }
     settleAt(place);
-    state.sorted.views.forEach((view) => { shown[view] = 1; });
+    for (const view of state.sorted.views) shown[view] = 1;
     drawAt(width, height);
     const image = canvas.toDataURL("image/png");
     redraw();

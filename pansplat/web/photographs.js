@@ -7,20 +7,20 @@ import { clamp, column, distanceOf, dot, minus, multiply, scaled } from "./graph
 import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
-export const STANDS = 0.03;                // metres from a panorama, at which the camera stands there
-const PHOTO_FADE = 0.2;             // seconds
-const FIRST = 0.1;                  // of a flight, for which a photograph is shown at both ends; it fades over as much
-const AROUND = 2.5;                 // metres, usual distance of surfaces: so far is the photograph of a camera beside it
-const DENSITY = 1.3;                // texels of a pixel in the middle of a face, at least
-const KEPT = 3;                     // photographs whose textures are kept
-const AT_ONCE = 6;                  // tiles that are read at the same time
-const SMALL_FACE = 2048;            // largest face on a phone, texels
+const DENSITY = 1.3; // texels of a pixel in the middle of a face, at least
+const KEPT = 3; // photographs whose textures are kept
+const AT_ONCE = 6; // tiles that are read at the same time
+const SMALL_FACE = 2048; // largest face on a phone, texels
 // Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
 const FACES = [
-  [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4], [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0], [[-1, 0, 0], [0, 1, 0], [0, 0, -1], 5],
-  [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1], [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2], [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
+  [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4],
+  [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0],
+  [[-1, 0, 0], [0, 1, 0], [0, 0, -1], 5],
+  [[0, 0, 1], [0, 1, 0], [-1, 0, 0], 1],
+  [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2],
+  [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
-const texts = new Map();            // of a page in one file: base64 of the tiles that have arrived
+const texts = new Map(); // of a page in one file: base64 of the tiles that have arrived
 
 // In a page of one file there is a script for the smallest tiles of a photograph and one for the others; they are in the
 // element before.
@@ -36,7 +36,7 @@ async function readTile({ key, tries }) {
     try {
       return await createImageBitmap(await fetchFile(`${key}.jpg`, tries > 0));
     } catch {
-      throw new Error(`${key}.jpg is missing, or is no tile`);  // a web server may answer with a page
+      throw new Error(`${key}.jpg is missing, or is no tile`); // a web server may answer with a page
     }
   }
   const image = new Image();
@@ -48,8 +48,12 @@ async function readTile({ key, tries }) {
 // One size of a photograph. `status` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
 // the time of the next one.
 class Level {
+  texture = null;
+  isFresh = true;
+  tiles = [];
+
   constructor(name, rotation, first, [size, step]) {
-    Object.assign(this, { size, texture: null, isFresh: true, tiles: [] });
+    this.size = size;
     const count = Math.ceil(size / step);
     FACES.forEach(([right, down, forward, face]) => {
       for (let row = 0; row < count; row++) {
@@ -58,7 +62,8 @@ class Level {
           const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
           const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
           const reach = Math.atan(Math.SQRT2 * step / size);
-          this.tiles.push({ key: `${name}_${first + this.tiles.length}`, face, x: across * step, y: row * step, direction, reach, status: null, tries: 0, due: 0 });
+          const key = `${name}_${first + this.tiles.length}`, place = { face, x: across * step, y: row * step };
+          this.tiles.push({ key, ...place, direction, reach, status: null, tries: 0, due: 0 });
         }
       }
     });
@@ -100,9 +105,15 @@ class Level {
 }
 
 class Photographs {
-  constructor() {
-    Object.assign(this, { opacity: 0, target: 0, node: null, wanted: null, last: null, reading: 0, made: new Map(), renderer: null });
-  }
+  opacity = 0;
+  target = 0;
+  node = null;
+  wanted = null;
+  last = null;
+  reading = 0;
+  made = new Map();
+  renderer = null;
+  program = null;
 
   // Whether nothing else is seen.
   get isOpaque() {
@@ -120,7 +131,7 @@ class Photographs {
 
   // The panorama at which the camera stands, as no eye of a headset does; the nearest where there is nothing else to show.
   findNode() {
-    const node = nodeHere(), isThere = !state.headset.session && distanceOf(GRAPH.positions[node], camera.position) <= STANDS;
+    const node = nodeHere(), isThere = !state.headset.session && distanceOf(GRAPH.positions[node], camera.position) <= HEADER.stopReach;
     return !state.doll.isOn && (isThere || isFixed()) ? node : null;
   }
 
@@ -130,7 +141,7 @@ class Photographs {
     if (!leg?.path || !leg.done || state.headset.session) return null;
     const isFirst = leg.done < 0.5, node = isFirst ? leg.from : leg.to;
     const isReady = node !== null && this.levelsOf(node)[0].isReady;
-    return { node, opacity: isReady ? clamp(2 - (isFirst ? leg.done : 1 - leg.done) / FIRST, 0, 1) : 0 };
+    return { node, opacity: isReady ? clamp(2 - (isFirst ? leg.done : 1 - leg.done) / HEADER.covered, 0, 1) : 0 };
   }
 
   // The smallest tiles of the photograph at the camera.
@@ -181,7 +192,7 @@ class Photographs {
   // Reads what the photograph at the camera needs, or that where a flight ends, and fades; `seconds` after the last time.
   update(seconds, size = fullSize()) {
     if (!HEADER.photographs.length || !state.renderer) return;
-    if (this.renderer !== state.renderer) {  // the graphics were lost
+    if (this.renderer !== state.renderer) { // the graphics were lost
       this.made.clear();
       Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph), opacity: 0 });
     }
@@ -198,7 +209,7 @@ class Photographs {
     if (isShown && this.node !== node) Object.assign(this, { node, opacity: 0 });
     this.target = isShown ? 1 : 0;
     if (this.opacity === this.target) return;
-    const step = state.still?.began === null ? 1 : seconds / PHOTO_FADE;  // the still covers it
+    const step = state.still?.began === null ? 1 : seconds / HEADER.stopSeconds; // the still covers it
     this.opacity = clamp(this.target, this.opacity - step, this.opacity + step);
     changed();
   }
@@ -249,7 +260,9 @@ class Photographs {
     // The rows of the inverse are the columns of the rotation; y of a cube map is up.
     const inverse = [0, 1, 2].map((k) => column(rotation, k)), turned = multiply(inverse, HEADER.photographs[this.node].rotation);
     gl.uniformMatrix3fv(places.camera_to_cube, false, turned.flatMap(([x, y, z]) => [x, -y, z]));
-    const beside = state.headset.session ? [0, 0, 0] : scaled(minus(camera.position, GRAPH.positions[this.node]), 1 / AROUND);
+    const offset = minus(camera.position, GRAPH.positions[this.node]), away = Math.hypot(...offset);
+    const part = state.headset.session ? 0 : Math.min(1 / HEADER.surfaces, HEADER.mostBeside / Math.max(away, 1e-9));
+    const beside = scaled(offset, part);
     gl.uniform3fv(places.beside, inverse.map((axis) => dot(axis, beside)));
     gl.uniform4f(places.window, ...center, ...half);
     gl.uniform2f(places.size, width, height);

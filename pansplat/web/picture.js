@@ -52,5 +52,5 @@ export function takePicture() {
   if (!state.renderer || !state.sorted) return null;
   drawAt(...fullSize());
   changed();
-  return new Promise((resolve) => { canvas.toBlob(resolve, "image/png"); });
+  return new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
 }

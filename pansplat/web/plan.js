@@ -9,9 +9,8 @@ import { camera, changed, state } from "./state.js";
 const flat = (position) => [0, 2].map((k) => dot(column(HEADER.level, k), position));
 
 class Plan {
-  constructor() {
-    Object.assign(this, { panel: byId("plan"), buttons: null });
-  }
+  panel = byId("plan");
+  buttons = null;
 
   get isOpen() {
     return !this.panel.hidden;

@@ -2,8 +2,7 @@
 
 import { column, dot, scaled } from "./graph.js";
 
-const BATCH = HEADER.batch;         // quads of one instance
-const TEXTURE_WIDTH = 2048;         // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
+const TEXTURE_WIDTH = 2048; // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
 // Draws to a WebGL 2 context: one layer for each view, and their mean by nearness (docs/rendering.md, section 7).
 export class Renderer {
@@ -22,12 +21,12 @@ export class Renderer {
     this.scales = this.makeTexture(width, height, gl.R32UI);
     this.colors = this.makeTexture(width, height, gl.RGBA8);
     this.order = this.makeTexture(width, height, gl.R32UI);
-    this.ready = new Set();  // views that have an order
+    this.ready = new Set(); // views that have an order
     this.splats = gl.createVertexArray();
     this.screen = gl.createVertexArray();
     gl.bindVertexArray(this.splats);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+    const corners = Uint16Array.from({ length: 6 * HEADER.batch }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     this.targets = [];
     this.size = [0, 0];
@@ -68,7 +67,7 @@ export class Renderer {
     gl.bindTexture(gl.TEXTURE_2D, texture);
     for (let first = start; first < end;) {
       const x = first % TEXTURE_WIDTH, width = Math.min(TEXTURE_WIDTH - x, end - first);
-      const height = Math.max(Math.floor((end - first) / TEXTURE_WIDTH) * (x === 0), 1);
+      const height = x === 0 ? Math.max(Math.floor((end - first) / TEXTURE_WIDTH), 1) : 1;
       const y = Math.floor(first / TEXTURE_WIDTH), offset = components * (first - start);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, x, y, width, height, channels, type, values, offset);
       first += width * height;
@@ -124,8 +123,8 @@ export class Renderer {
   }
 
   // Adds up the layers of the views in targets of `makeTargets`.
-  addLayers(camera, weights, [layer, sum], width, height) {
-    const gl = this.gl;
+  addLayers(camera, weights, targets, width, height) {
+    const gl = this.gl, [layer, sum] = targets;
     gl.viewport(0, 0, width, height);
     gl.disable(gl.DEPTH_TEST);
     gl.activeTexture(gl.TEXTURE0);
@@ -221,7 +220,7 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.splats);
     gl.uniform2i(this.splat.places.segment, start, count);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * HEADER.batch, gl.UNSIGNED_SHORT, 0, Math.ceil(count / HEADER.batch));
   }
 
   addLayer(textures, weight, isFirst) {

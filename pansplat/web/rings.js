@@ -8,9 +8,9 @@ import { goTo } from "./flight.js";
 import { clamp, column, distanceOf, dot, minus } from "./graph.js";
 import { camera, state } from "./state.js";
 
-const ARROW = 44, BORDER = 8;                   // pixels: size of an arrow, and to the border
-const MAX_ARROWS = 3;                           // at a side of the picture
-let rings = [], chosenFor = null, chosen = [];  // for a panorama
+const ARROW = 44, BORDER = 8; // pixels: size of an arrow, and to the border
+const MAX_ARROWS = 3; // at a side of the picture
+let rings = [], chosenFor = null, chosen = []; // for a panorama
 
 export function makeRings() {
   const links = HEADER.links.filter((link) => link.mark);
@@ -18,9 +18,9 @@ export function makeRings() {
   rings = marks.map(({ node, link }) => {
     const { name, position, mark } = HEADER.spots[node], text = make("small", "");
     const label = make("span", "", make("b", "", name), text), button = make("button", "", label);
-    const place = link ? { mark: link.mark, camera: null, radius: HEADER.spots[link.from].radius } : { mark, camera: position, radius: HEADER.spots[node].radius };
+    const place = link ? { mark: link.mark, camera: null } : { mark, camera: position };
     const heightOf = (point) => dot(column(HEADER.level, 1), point);
-    const isUpright = link !== null && heightOf(link.mark) < heightOf(HEADER.spots[link.from].mark) - 0.5 * place.radius;
+    const isUpright = link !== null && heightOf(link.mark) < heightOf(HEADER.spots[link.from].mark) - 0.5 * HEADER.ringRadius;
     button.hidden = true;
     button.onclick = () => goTo(node);
     byId("spots").append(button);
@@ -47,7 +47,7 @@ function update() {
 export function findRings() {
   update();
   if (state.doll.isOn) return rings.filter(({ link, node }) => !link && isInDoll(node));
-  return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= 2 * ring.radius);
+  return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= HEADER.ringDistance);
 }
 
 // Rings in perspective, and arrows at the border to those that are outside or under a control; none while the camera flies. A
@@ -57,23 +57,23 @@ export function placeRings(rotation) {
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
   const bars = ["buttons", "place", "plan"].map((id) => byId(id).getBoundingClientRect()).map((bar) => [bar.left, bar.top, bar.right, bar.bottom]);
   const taken = [...bars], sides = { left: 0, right: 0, up: 0, down: 0 };
-  rings.forEach(({ button }) => { button.hidden = true; });
+  for (const { button } of rings) button.hidden = true;
   const placed = found.map((ring) => {
     const isMoved = state.doll.isOn && isInDoll(ring.node), mark = isMoved ? placeInDoll(ring.node, ring.mark).place : ring.mark;
     const offset = minus(mark, camera.position), [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
     return { ring, offset, distance: Math.hypot(...offset), place: findPlace(ring, [x, y, z], focal, bars) };
   });
-  for (const { ring, offset, place } of placed.sort((a, b) => !a.place - !b.place || a.distance - b.distance)) {
-    const { button, label } = ring, { style } = button, box = place || findBorder(offset, focal, sides, taken);
-    if (!box) continue;
-    const [left, top, right, bottom] = box;
+  for (const { ring, offset, place } of placed.sort((a, b) => Number(!a.place) - Number(!b.place) || a.distance - b.distance)) {
+    const { button, label } = ring, { style } = button, found = place ? { box: place, side: null } : findBorder(offset, focal, sides, taken);
+    if (!found) continue;
+    const { box, side } = found, [left, top, right, bottom] = box;
     button.hidden = false;
-    button.className = place ? "" : `arrow ${box.side}`;
+    button.className = place ? "" : `arrow ${side}`;
     Object.assign(style, { width: `${right - left}px`, height: `${bottom - top}px`, transform: `translate(${left}px, ${top}px)` });
     style.borderWidth = place ? `${clamp(0.09 * (right - left), 2, 6)}px` : "";
     ring.size ||= [label.offsetWidth, label.offsetHeight];
     const [wide, tall] = ring.size, middle = [0.5 * (left + right - wide), 0.5 * (top + bottom - tall)];
-    const [x0, y0] = { left: [right, middle[1]], right: [left - wide, middle[1]], down: [middle[0], top - tall] }[box.side] || [middle[0], bottom];
+    const [x0, y0] = { left: [right, middle[1]], right: [left - wide, middle[1]], down: [middle[0], top - tall] }[side] || [middle[0], bottom];
     const labelBox = [x0, y0, x0 + wide, y0 + tall], isFree = taken.every((other) => !isCovered(labelBox, other));
     label.style.visibility = isFree ? "" : "hidden";
     if (isFree) taken.push(labelBox);
@@ -82,34 +82,38 @@ export function placeRings(rotation) {
 }
 
 // The box of a ring in the picture; null for one outside or under a control. On the floor it is seen from above.
-function findPlace({ radius, isUpright }, [x, y, z], focal, bars) {
+function findPlace({ isUpright }, [x, y, z], focal, bars) {
   const { clientWidth: width, clientHeight: height } = canvas, [left, top] = [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
-  const size = clamp(2 * radius * focal / z, 16, 128), tall = isUpright ? size : size * clamp(y / Math.hypot(x, y, z), 0.25, 1);
+  const size = clamp(2 * HEADER.ringRadius * focal / z, 16, 128), tall = isUpright ? size : size * clamp(y / Math.hypot(x, y, z), 0.25, 1);
   const box = [left - 0.5 * size, top - 0.5 * tall, left + 0.5 * size, top + 0.5 * tall];
-  return z > 0.1 * radius && left > 0 && left < width && top > 0 && top < height && !bars.some((bar) => isCovered(box, bar)) ? box : null;
+  return z > 0.1 * HEADER.ringRadius && left > 0 && left < width && top > 0 && top < height && !bars.some((bar) => isCovered(box, bar)) ? box : null;
 }
 
-// The box of an arrow to where the camera turns towards an offset, and its `side`; null where the side is full.
+// The `box` of an arrow to where the camera turns towards an offset, and its `side`; null where the side is full.
 function findBorder(offset, focal, sides, taken) {
   const { clientWidth: width, clientHeight: height } = canvas, [right, down, forward] = [0, 1, 2].map((k) => dot(column(HEADER.level, k), offset));
   const across = Math.atan2(right, forward) - camera.yaw, around = Math.atan2(Math.sin(across), Math.cos(across));
   const above = -Math.atan2(down, Math.hypot(right, forward)) - camera.pitch, isBeside = Math.abs(around) > Math.atan(0.5 * width / focal);
   const side = state.doll.isOn ? null : isBeside ? around < 0 ? "left" : "right" : above > 0 ? "up" : "down";
   if (side === null || sides[side] === MAX_ARROWS) return null;
-  const most = [width, height].map((length) => length - ARROW - BORDER), half = 0.5 * ARROW, [x, y] = [around, -above].map((angle) => focal * Math.tan(clamp(angle, -1.5, 1.5)));
+  const most = [width, height].map((length) => length - ARROW - BORDER),
+    half = 0.5 * ARROW,
+    [x, y] = [around, -above].map((angle) => focal * Math.tan(clamp(angle, -1.5, 1.5)));
   const at = [0.5 * width + x - half, 0.5 * height + y - half];
   const inward = { left: [1, 0], right: [-1, 0], up: [0, 1], down: [0, -1] }[side], steps = [...Array(40).keys()].map((k) => (k % 2 ? 1 : -1) * half * Math.ceil(k / 2));
-  const boxes = [0, 1, 2].flatMap((row) => steps.map((step) => {  // beside the place, else above what is there
-    const [left, top] = at.map((value, k) => clamp(value + step * !inward[k], BORDER, most[k]) + row * (ARROW + BORDER) * inward[k]);
-    return [left, top, left + ARROW, top + ARROW];
-  }));
+  const boxes = [0, 1, 2].flatMap((row) =>
+    steps.map((step) => { // beside the place, else above what is there
+      const [left, top] = at.map((value, k) => clamp(value + (inward[k] ? 0 : step), BORDER, most[k]) + row * (ARROW + BORDER) * inward[k]);
+      return [left, top, left + ARROW, top + ARROW];
+    })
+  );
   const box = boxes.find((each) => taken.every((other) => !isCovered(each, other)));
   if (!box) return null;
   sides[side] += 1;
-  return Object.assign(box, { side });
+  return { box, side };
 }
 
-const listed = [];  // a button for each panorama
+const listed = []; // a button for each panorama
 
 // The panoramas in the order of the tour.
 export function makeList() {

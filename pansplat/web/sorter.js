@@ -37,13 +37,13 @@ function evaluateColors({ start, count }, [x, y, z]) {
   const { means, base, harmonics, colors, terms, harmonicsScale, colorRange: [low, high] } = scene, basis = new Float32Array(terms);
   const unit = 255 / (high - low), step = unit * harmonicsScale / 127;
   for (let i = start; i < start + count; i++) {
-    let dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z;
+    const dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z;
     const inverse = 1 / Math.max(Math.hypot(dx, dy, dz), 1e-12);
     evaluateBasis(dx * inverse, dy * inverse, dz * inverse, basis);
     for (let channel = 0; channel < 3; channel++) {
       let sum = 0;
       for (let term = 0; term < terms; term++) sum += basis[term] * harmonics[3 * (terms * i + term) + channel];
-      const black = -unit * low;  // the clamp of colours at 0
+      const black = -unit * low; // the clamp of colours at 0
       colors[4 * i + channel] = Math.max(base[4 * i + channel] + step * sum, black);
     }
   }

@@ -5,7 +5,9 @@ import { distanceOf, partOfEdge } from "./graph.js";
 
 export const { edges, parts } = HEADER;
 export const GRAPH = {
-  ...HEADER, positions: HEADER.spots.map((spot) => spot.position), clearances: HEADER.spots.map((spot) => spot.clearances),
+  ...HEADER,
+  positions: HEADER.spots.map((spot) => spot.position),
+  clearances: HEADER.spots.map((spot) => spot.clearances),
 };
 
 export const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
@@ -15,17 +17,26 @@ export const camera = makeStart();
 export const shown = HEADER.views.map(() => 0);
 
 export const state = {
-  edge: 0, group: edges.length ? edges[0][2] : 0, fade: null,  // at the camera; `fade`: from the views of another group
-  requested: new Set(), received: new Set(),                   // views whose data is loaded, and is there
-  missing: new Set(),                                          // those that do not arrive; they are still tried
-  sorted: null, isSorting: false,                              // the last order of the worker (sorter.js)
-  renderer: null,                                              // null while the graphics are lost
-  isDirty: true, drawnScale: 0, lastChange: 0,                 // of the picture
-  flight: null, isTouring: false, still: null,                 // flight.js
+  edge: 0,
+  group: edges.length ? edges[0][2] : 0,
+  fade: null, // at the camera; `fade`: from the views of another group
+  requested: new Set(),
+  received: new Set(), // views whose data is loaded, and is there
+  missing: new Set(), // those that do not arrive; they are still tried
+  sorted: null,
+  isSorting: false, // the last order of the worker (sorter.js)
+  renderer: null, // null while the graphics are lost
+  isDirty: true,
+  drawnScale: 0,
+  lastChange: 0, // of the picture
+  flight: null,
+  isTouring: false,
+  still: null, // flight.js
   doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: 0 },
-  headset: { session: null, turnTo() {} },                     // xr.js
-  here: null,                                                  // the panorama at the camera of the last frame
-  step: [0, 0, 0], isFast: false,                              // of the keys that are held: right, up, forward
+  headset: { session: null, turnTo(_yaw) {} }, // xr.js
+  here: null, // the panorama at the camera of the last frame
+  step: [0, 0, 0],
+  isFast: false, // of the keys that are held: right, up, forward
 };
 
 export function changed() {

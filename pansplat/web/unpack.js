@@ -3,10 +3,10 @@
 // it is complete. docs/web.md describes the data.
 
 let scene = null;
-const arrived = [], writers = new Map();  // views, and where their data goes
-let first = null;  // what is sorted as soon as a view of its part has arrived, before the parts that wait
+const arrived = [], writers = new Map(); // views, and where their data goes
+let first = null; // what is sorted as soon as a view of its part has arrived, before the parts that wait
 
-onmessage = ({ data }) => {
+self.onmessage = ({ data }) => {
   if (data.header) begin(data.header);
   else if (data.chunk !== undefined) receive(data);
   else sort(data);
@@ -26,7 +26,7 @@ function receive({ view, chunk, isLast }) {
     readView(view, stream.readable.getReader()).catch((error) => postMessage({ error: String(error.message || error) }));
   }
   const writer = writers.get(view);
-  writer.write(typeof chunk === "string" ? decode(chunk) : new Uint8Array(chunk)).catch(() => {});  // its error is that of the reader
+  writer.write(typeof chunk === "string" ? decode(chunk) : new Uint8Array(chunk)).catch(() => {}); // its error is that of the reader
   if (isLast) writer.close().catch(() => {});
 }
 
@@ -73,7 +73,7 @@ function unpack(planes, view) {
     put(scales, 1, 0, 24 - 8 * byte, 9 + byte);
     put(geometry, 4, 3, 24 - 8 * byte, 15 + byte);
   }
-  put(geometry, 4, 0, 0, 19);  // opacity
+  put(geometry, 4, 0, 0, 19); // opacity
   put(geometry, 4, 1, 0, 13);
   put(geometry, 4, 2, 0, 14);
   for (let channel = 0; channel < 3; channel++) put(colors, 4, channel, 0, 20 + channel);

@@ -15,26 +15,27 @@ import { findRings } from "./rings.js";
 import { camera, changed, state } from "./state.js";
 
 const XR_FEATURES = ["local-floor", "hand-tracking"];
-const XR_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]];  // of WebXR to OpenCV, and back
-const SNAP_TURN = Math.PI / 6;      // radians
-const DEAD_ZONE = 0.2;              // of a stick
-const MIN_POINTING = 0.06;          // radians between a ray and the centre of a ring that it selects
-const RAY_LENGTH = 3;               // metres
-const FLOOR_SPEED = 5;              // of the way to the height of a new floor, a second
-const HEIGHT_RATIO = 1.5;           // of the head to the panorama's camera, both over their floors
-const MIN_RATE = 72, LOWEST_RATE = 60;  // frames a second: if the device has a choice, and of any device
-const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30;  // of the resolution, after so many frames
-const PLAIN = 0, RING = 1, VIGNETTE = 2, PICTURE = 3;  // shapes of shaders/mark.frag
-const BUTTONS = { 4: () => goHome(), 5: () => headset.leave() };  // A and X, B and Y
+const XR_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]; // of WebXR to OpenCV, and back
+const SNAP_TURN = Math.PI / 6; // radians
+const DEAD_ZONE = 0.2; // of a stick
+const MIN_POINTING = 0.06; // radians between a ray and the centre of a ring that it selects
+const RAY_LENGTH = 3; // metres
+const FLOOR_SPEED = 5; // of the way to the height of a new floor, a second
+const HEIGHT_RATIO = 1.5; // of the head to the panorama's camera, both over their floors
+const MIN_RATE = 72, LOWEST_RATE = 60; // frames a second: if the device has a choice, and of any device
+const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30; // of the resolution, after so many frames
+const PLAIN = 0, RING = 1, VIGNETTE = 2, PICTURE = 3; // shapes of shaders/mark.frag
+const BUTTONS = { 4: () => goHome(), 5: () => headset.leave() }; // A and X, B and Y
 
 const rowsOf = (matrix) => [0, 1, 2].map((row) => [0, 1, 2].map((k) => matrix[4 * k + row]));
 const pointOf = ({ x, y, z }) => [x, y, z];
 const unit = (vector) => scaled(vector, 1 / Math.max(Math.hypot(...vector), 1e-9));
 
 class Headset {
-  constructor() {
-    Object.assign(this, { gl: null, session: null, works: false, isEntering: false });
-  }
+  gl = null;
+  session = null;
+  works = false;
+  isEntering = false;
 
   // Shows the button where there is a headset, and otherwise what to do.
   async offer() {
@@ -76,9 +77,14 @@ class Headset {
   start(session) {
     if (state.doll.isOn) jumpTo(state.doll.node);
     this.heading = this.headYaw = 0;
-    this.head = this.origin = this.left = this.floor = this.hovered = null;
+    this.head =
+      this.origin =
+      this.left =
+      this.floor =
+      this.hovered =
+        null;
     this.last = performance.now();
-    this.motion = 0;  // strength of the vignette
+    this.motion = 0; // strength of the vignette
     this.pressed = new Map();
     this.isTurned = false;
     Object.assign(this, { scale: 1, times: [], interval: null, steady: 0, patience: 1, isRaised: false });
@@ -88,7 +94,9 @@ class Headset {
     session.addEventListener("end", () => this.end());
     session.addEventListener("select", (event) => this.select(event, calm.matches));
     session.addEventListener("squeeze", (event) => this.select(event, true));
-    this.space.addEventListener("reset", () => { this.head = null; });
+    this.space.addEventListener("reset", () => {
+      this.head = null;
+    });
     this.session = session;
     byId("vr").setAttribute("aria-pressed", true);
     session.requestAnimationFrame((now, frame) => this.onFrame(now, frame));
@@ -126,15 +134,15 @@ class Headset {
     const elapsed = now - this.last, seconds = clamp(elapsed, 0, 100) / 1000;
     this.last = now;
     const pose = frame.getViewerPose(this.space);
-    if (!pose || !state.renderer || !state.sorted) return;  // not tracked; the graphics are lost
+    if (!pose || !state.renderer || !state.sorted) return; // not tracked; the graphics are lost
     advance(now, seconds);
     this.followHead(pose.transform, seconds);
     const isWalking = this.readControllers(seconds);
-    if (!this.session) return;  // a button has ended it
+    if (!this.session) return; // a button has ended it
     this.left = [...camera.position];
     requestSort(SORT_DISTANCE);
     this.adaptScale(1000 * seconds);
-    this.motion += ((isWalking || isFlying()) - this.motion) * Math.min(8 * seconds, 1);
+    this.motion += (Number(isWalking || isFlying()) - this.motion) * Math.min(8 * seconds, 1);
     const marks = this.findMarks(frame), layer = session.renderState.baseLayer;
     for (const view of pose.views) {
       if (view.requestViewportScale) view.requestViewportScale(this.scale);
@@ -219,7 +227,7 @@ class Headset {
     let [right, forward, turn] = [0, 0, 0];
     for (const source of this.session.inputSources) {
       const { gamepad, handedness } = source;
-      if (!gamepad || gamepad.mapping !== "xr-standard") continue;
+      if (gamepad?.mapping !== "xr-standard") continue;
       const [x = 0, y = 0] = gamepad.axes.slice(gamepad.axes.length >= 4 ? 2 : 0);
       if (handedness === "left") right += x;
       else if (Math.abs(x) > Math.abs(y)) turn = x;
@@ -253,7 +261,7 @@ class Headset {
     const found = findRings().map((ring) => {
       const offset = minus(ring.mark, ray.origin), distance = Math.hypot(...offset);
       const angle = Math.acos(clamp(dot(ray.direction, offset) / Math.max(distance, 1e-6), -1, 1));
-      return { ring, distance, angle, limit: Math.max(1.2 * ring.radius / Math.max(distance, 1e-6), MIN_POINTING) };
+      return { ring, distance, angle, limit: Math.max(1.2 * HEADER.ringRadius / Math.max(distance, 1e-6), MIN_POINTING) };
     });
     return found.filter(({ angle, limit }) => angle < limit).sort((a, b) => a.angle - b.angle)[0] || null;
   }
@@ -275,7 +283,7 @@ class Headset {
     const sum = times.reduce((a, b) => a + b), isKnown = session.frameRate || this.interval;
     if (isKnown ? times.length < FRAMES : sum < 1000) return;
     this.times = [];
-    if (!isKnown) {  // the device states no rate: the median of the first second, which may be late
+    if (!isKnown) { // the device states no rate: the median of the first second, which may be late
       this.interval = Math.min(times.sort((a, b) => a - b)[times.length >> 1], 1000 / LOWEST_RATE);
       return;
     }
@@ -311,14 +319,14 @@ class Headset {
     }
     for (const ring of findRings()) {
       const strength = pointed.has(ring) ? 1 : 0.6, across = unit(cross(down, minus(ring.mark, camera.position)));
-      const axes = (ring.isUpright ? [across, down] : [right, ahead]).map((axis) => scaled(axis, ring.radius));
+      const axes = (ring.isUpright ? [across, down] : [right, ahead]).map((axis) => scaled(axis, HEADER.ringRadius));
       marks.push({ center: ring.mark, axes, shape: RING, color: Array(4).fill(strength) });
     }
     const [ring] = pointed.keys();
     if (ring) {
       const size = 0.05 * pointed.get(ring), across = unit(cross(down, minus(ring.mark, camera.position)));
       const axes = [scaled(across, 8 * size), scaled(down, size)];
-      marks.push({ center: minus(ring.mark, scaled(down, 2 * ring.radius)), axes, shape: PICTURE, color: [1, 1, 1, 1], ring });
+      marks.push({ center: minus(ring.mark, scaled(down, 2 * HEADER.ringRadius)), axes, shape: PICTURE, color: [1, 1, 1, 1], ring });
     }
     return marks;
   }
@@ -384,4 +392,5 @@ class Headset {
   }
 }
 
-export const headset = state.headset = new Headset();
+export const headset = new Headset();
+state.headset = headset;

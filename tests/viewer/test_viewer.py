@@ -31,7 +31,7 @@ from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, l
 from pansplat_viewer.scene.settings import FrameStats
 from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.viewer import Viewer
-from pansplat_viewer.window.input import FAST, FLY_SPEED, KEYS, SLOW, Input
+from pansplat_viewer.window.input import FAST, KEYS, SLOW, WALK_SPEED, Input
 
 SIZE = (560, 900)
 CENTER = (0.5, 0.5)
@@ -203,7 +203,7 @@ class Gate:
 
 # --- what a user does, and the state after it ---
 
-STEP = FLY_SPEED / 30  # of a frame
+STEP = WALK_SPEED / 30  # of a frame
 ROWS = [  # at the first of two panoramas, which are 0.5 m apart
     *[(f"hold {key}", "camera.position == approx((0, 0, STEP))") for key in ("w", "up")],
     *[(f"hold {key}", "camera.position == approx((0, 0, -STEP))") for key in ("s", "down")],

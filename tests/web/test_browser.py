@@ -1577,7 +1577,7 @@ def test_a_link_opens_its_pose(chromium: Any, folder: Path) -> None:
         assert page.run("pansplat.getPose().yaw") == pytest.approx(-123.4)
         page.run("location.hash = '#at=0,0,0,10,0,400'")
         page.wait("Math.abs(pansplat.camera.yaw - 10 * Math.PI / 180) < 1e-9")
-        assert page.camera["fov"] == 110 and page.messages == []
+        assert page.camera["fov"] == 130 and page.messages == []
         assert page.run("HEADER.start.fov") == start["fov"]
 
 

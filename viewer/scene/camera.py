@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.constants import MAX_FOV_DEGREES, MIN_FOV_DEGREES
+from pansplat.constants import MAX_FOV_DEGREES, MAX_PITCH_DEGREES, MIN_FOV_DEGREES
 from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.path import turn_axes
 
-MAX_PITCH_RADIANS = math.radians(89.9)
+MAX_PITCH_RADIANS = math.radians(MAX_PITCH_DEGREES)
 MIN_DISTANCE = 0.05  # metres, from the orbit centre
 
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.tours.links import find_link_ring
+from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.picking import project_point
 from pansplat_viewer.scene.tour import TourScenes
 
-_RADIUS = 0.22  # metres
 _MIN_PIXELS = 14.0  # of the radius within which a click is meant
 
 
@@ -51,7 +50,7 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
     feet = {
         node: (tour.positions[node] + below, tour.panoramas[node].label)
         for node in (here, *(seen if seen or links else flown[:1]))
-        if np.linalg.norm(tour.positions[node] - position) >= 3 * _RADIUS
+        if np.linalg.norm(tour.positions[node] - position) >= RING_DISTANCE
     }
     for node, link in links.items():
         if (node in hidden or tour.is_fade(here, node)) and node not in feet:
@@ -82,7 +81,7 @@ def _make_hotspot(
     across, along = (np.cross(down, foot - camera.position), down) if is_upright else (right, forward)
     angles = np.arange(24) * (2 * np.pi / 24)
     circle = np.cos(angles)[:, None] * (across / np.linalg.norm(across)) + np.sin(angles)[:, None] * along
-    circle = foot + _RADIUS * circle
+    circle = foot + RING_RADIUS * circle
     center = project_point(camera, tuple(foot), size)
     ring = [project_point(camera, tuple(corner), size) for corner in circle]
     if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):

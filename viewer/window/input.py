@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from pansplat.constants import FAST, WALK_SPEED
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, limit_camera, toggle_play
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-FLY_SPEED = 1.0  # metres per second
-FAST, SLOW = 4.0, 0.2
+SLOW = 0.2  # of the speed, while Alt is held
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
@@ -206,7 +206,7 @@ def _move_camera(state: ViewerState, events: Input) -> None:
         if events.scroll:
             camera = cameras.dolly(camera, events.scroll)
     else:
-        step = axes * FLY_SPEED * state.speed * factor * events.seconds
+        step = axes * WALK_SPEED * state.speed * factor * events.seconds
         if axes.any():
             camera = cameras.fly(camera, *step)
         if any(events.drag):
