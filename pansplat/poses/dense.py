@@ -14,13 +14,13 @@ import math
 from dataclasses import dataclass
 
 import cv2
-import numba as nb
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.poses.depth import DepthMap, sample_nearest
+from pansplat.poses.solvers import compiled
 
 _HEIGHT = 96  # rows of the maps that are compared
 _COARSE, _FINE = 4, 2  # of many poses, every fourth or second row and column are compared
@@ -146,11 +146,12 @@ def _upright_rays() -> Float[Array, "h 2*h 3"]:
     return pixel_directions(_HEIGHT, 2 * _HEIGHT).numpy().astype(np.float32)
 
 
-@nb.njit(fastmath=True, cache=True, nogil=True)
+@compiled
 def _compare_one_way(rays, source, target, rotations, translations, step):
     height, width = target.shape[:2]
     count = len(rotations)
     result = np.zeros((count, 5))
+    points = rays[step // 2 :: step, step // 2 :: step] * np.exp(source[step // 2 :: step, step // 2 :: step, :1])
     for n in range(count):
         r, t = rotations[n], translations[n]
         total = common = conflict = 0.0
@@ -158,8 +159,8 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
         for i in range(step // 2, height, step):
             weight = math.cos(((i + 0.5) / height - 0.5) * math.pi)
             for j in range(step // 2, width, step):
-                depth, deviation = math.exp(source[i, j, 0]), source[i, j, 1]
-                x, y, z = rays[i, j, 0] * depth, rays[i, j, 1] * depth, rays[i, j, 2] * depth
+                point = points[i // step, j // step]
+                x, y, z = point[0], point[1], point[2]
                 px = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
                 py = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
                 pz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
@@ -168,9 +169,9 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
                 distance = math.sqrt(flat + py * py)
                 if distance < _NEAREST:
                     continue
-                column = int((math.atan2(px, pz) / (2 * math.pi) + 0.5) * width) % width
-                row = min(max(int((math.atan2(py, math.sqrt(flat)) / math.pi + 0.5) * height), 0), height - 1)
-                uncertain = deviation + target[row, column, 1]
+                column = min(int((_arctan2(px, pz) / (2 * math.pi) + 0.5) * width), width - 1)
+                row = min(max(int((_arctan2(py, math.sqrt(flat)) / math.pi + 0.5) * height), 0), height - 1)
+                uncertain = source[i, j, 1] + target[row, column, 1]
                 error = math.log(distance) - target[row, column, 0]
                 if abs(error) < _TOLERANCE + uncertain:
                     facing = 0.0
@@ -202,3 +203,20 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
                         hue[m] += squares[m]
             result[n, 4] = hue[2] / (math.sqrt(max(hue[0] * hue[1], 0.0)) + _LEAST_HUE**2)
     return result
+
+
+@compiled
+def _arctan2(y, x):
+    """The angle of a vector within 1e-5 radians. Source: C. Hastings, Approximations for Digital Computers, 1955."""
+    high, low = max(abs(x), abs(y)), min(abs(x), abs(y))
+    ratio = low / max(high, np.float32(1e-30))
+    square = ratio * ratio
+    angle = np.float32(-0.0117212)
+    for factor in (0.05265332, -0.11643287, 0.19354346, -0.33262347, 0.99997726):
+        angle = angle * square + np.float32(factor)
+    angle *= ratio
+    if abs(y) > abs(x):
+        angle = np.float32(math.pi / 2) - angle
+    if x < 0:
+        angle = np.float32(math.pi) - angle
+    return math.copysign(angle, y)
