@@ -9,6 +9,7 @@ Source: J. Coughlan, A. Yuille, Manhattan World, ICCV 1999; segments: R. Grompon
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 from pansplat.poses.features import FACE_ROTATIONS, render_face
-from pansplat.poses.solvers import rotation_angle, rotation_exp, rotation_log
+from pansplat.poses.solvers import rotation_angle, rotation_exp, skew
 
 _MIN_LENGTH = math.radians(2.5)  # of a segment
 _NORMAL_NOISE = 4e-3  # standard deviation of a normal, radians
@@ -159,19 +160,19 @@ class RotationPrior:
         both = math.hypot(self.first.noise, self.second.noise)
         return _TILT_NOISE * both, _YAW_NOISE * both
 
-    def wall_rotations(self) -> list[Float[Array, "3 3"]]:
+    @functools.cached_property
+    def wall_rotations(self) -> Float[Array, "n 3 3"]:
         """The four rotations from the first camera to the second one that make the walls parallel; none without."""
-        rotations = []
-        for cosine, sine in ((1, 0), (0, 1), (-1, 0), (0, -1)) if self.has_walls else ():
+        rotations = np.empty((4 if self.has_walls else 0, 3, 3))
+        for n, (cosine, sine) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))[: len(rotations)]):
             quarter = np.array(((1.0, 0, 0), (0, cosine, -sine), (0, sine, cosine)))
-            rotations.append(self.second.axes.T @ quarter @ self.first.axes)
+            rotations[n] = self.second.axes.T @ quarter @ self.first.axes
         return rotations
 
     def _turn_from_walls(self, rotation: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
         """The smallest rotation from one with parallel walls to this one, for known walls."""
-        return min(
-            (walls.T @ rotation for walls in self.wall_rotations()), key=lambda turn: float(rotation_angle(turn))
-        )
+        nearest = (self.wall_rotations.reshape(4, 9) @ rotation.reshape(9)).argmax()  # by the cosine of the angle
+        return self.wall_rotations[nearest].T @ rotation
 
     def residual(self, rotation: Float[Array, "3 3"]) -> tuple[Float[Array, "n"], Float[Array, "n 3"]] | None:
         """Tilt (3) and, with walls, yaw (1) against the axes in units of their noise, and the derivative by rotation.
@@ -180,17 +181,20 @@ class RotationPrior:
         """
         if not self.has_down:
             return None
-        turned, down = rotation @ self.first.axes[0], self.second.axes[0]
-        tilt_noise, yaw_noise = self.noise
-        tilt = np.cross(down, turned) / tilt_noise
-        derivative = ((down @ turned) * np.eye(3) - np.outer(turned, down)) / tilt_noise
-        if np.linalg.norm(tilt) > _LARGEST_RESIDUAL or down @ turned < 0:
+        turned = rotation @ self.first.axes[0]
+        across = skew(self.second.axes[0]) / self.noise[0]
+        tilt = across @ turned
+        if tilt @ tilt > _LARGEST_RESIDUAL**2 or self.second.axes[0] @ turned < 0:
             return None
+        derivative = -across @ skew(turned)
         if self.has_walls:
-            yaw = float(self.first.axes[0] @ rotation_log(self._turn_from_walls(rotation))) / yaw_noise
+            turn = self._turn_from_walls(rotation)  # less than half a turn, because gravity agrees
+            axis = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2
+            sine = max(math.sqrt(axis @ axis), 1e-12)
+            angle = math.atan2(sine, (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1) / 2)
+            yaw = angle / sine * float(self.first.axes[0] @ axis) / self.noise[1]
             if abs(yaw) < _LARGEST_RESIDUAL:
-                tilt = np.append(tilt, yaw)
-                derivative = np.concatenate((derivative, turned[None] / yaw_noise))
+                return np.append(tilt, yaw), np.concatenate((derivative, turned[None] / self.noise[1]))
         return tilt, derivative
 
     def confirms(self, rotation: Float[Array, "3 3"]) -> bool:

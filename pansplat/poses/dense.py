@@ -14,13 +14,13 @@ import math
 from dataclasses import dataclass
 
 import cv2
-import numba as nb
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.poses.depth import DepthMap, sample_nearest
+from pansplat.poses.solvers import compiled
 
 _HEIGHT = 96  # rows of the maps that are compared
 _COARSE, _FINE = 4, 2  # of many poses, every fourth or second row and column are compared
@@ -95,6 +95,11 @@ class Surroundings:
         maps = np.dstack((log_depth, deviation, _find_normals(log_depth), *sampled))
         return np.ascontiguousarray(maps, np.float32)
 
+    @functools.cached_property
+    def points(self) -> Float[Array, "h 2*h 3"]:
+        """The surfaces in the frame of the upright camera, camera heights."""
+        return _upright_rays() * np.exp(self.maps[:, :, :1])
+
 
 def overlap_weight(overlap: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Weight of the likeness and the shade of directions with this share of the sphere."""
@@ -127,7 +132,7 @@ def _compare_all(first: Surroundings, second: Surroundings, rotations: Array, tr
     values = np.zeros((len(rotations), 5))
     for (turns, translations), source, target in ((there, first, second), (back, second, first)):
         values += 0.5 * _compare_one_way(
-            _upright_rays(), source.maps, target.maps, turns.astype(np.float32), translations.astype(np.float32), step
+            source.points, source.maps, target.maps, turns.astype(np.float32), translations.astype(np.float32), step
         )
     return values
 
@@ -146,8 +151,8 @@ def _upright_rays() -> Float[Array, "h 2*h 3"]:
     return pixel_directions(_HEIGHT, 2 * _HEIGHT).numpy().astype(np.float32)
 
 
-@nb.njit(fastmath=True, cache=True, nogil=True)
-def _compare_one_way(rays, source, target, rotations, translations, step):
+@compiled
+def _compare_one_way(points, source, target, rotations, translations, step):
     height, width = target.shape[:2]
     count = len(rotations)
     result = np.zeros((count, 5))
@@ -158,8 +163,7 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
         for i in range(step // 2, height, step):
             weight = math.cos(((i + 0.5) / height - 0.5) * math.pi)
             for j in range(step // 2, width, step):
-                depth, deviation = math.exp(source[i, j, 0]), source[i, j, 1]
-                x, y, z = rays[i, j, 0] * depth, rays[i, j, 1] * depth, rays[i, j, 2] * depth
+                x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
                 px = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
                 py = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
                 pz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
@@ -168,9 +172,9 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
                 distance = math.sqrt(flat + py * py)
                 if distance < _NEAREST:
                     continue
-                column = int((math.atan2(px, pz) / (2 * math.pi) + 0.5) * width) % width
-                row = min(max(int((math.atan2(py, math.sqrt(flat)) / math.pi + 0.5) * height), 0), height - 1)
-                uncertain = deviation + target[row, column, 1]
+                column = min(int((_arctan2(px, pz) / (2 * math.pi) + 0.5) * width), width - 1)
+                row = min(max(int((_arctan2(py, math.sqrt(flat)) / math.pi + 0.5) * height), 0), height - 1)
+                uncertain = source[i, j, 1] + target[row, column, 1]
                 error = math.log(distance) - target[row, column, 0]
                 if abs(error) < _TOLERANCE + uncertain:
                     facing = 0.0
@@ -202,3 +206,20 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
                         hue[m] += squares[m]
             result[n, 4] = hue[2] / (math.sqrt(max(hue[0] * hue[1], 0.0)) + _LEAST_HUE**2)
     return result
+
+
+@compiled
+def _arctan2(y, x):
+    """The angle of a vector within 1e-5 radians. Source: C. Hastings, Approximations for Digital Computers, 1955."""
+    high, low = max(abs(x), abs(y)), min(abs(x), abs(y))
+    ratio = low / max(high, np.float32(1e-30))
+    square = ratio * ratio
+    angle = np.float32(-0.0117212)
+    for factor in (0.05265332, -0.11643287, 0.19354346, -0.33262347, 0.99997726):
+        angle = angle * square + np.float32(factor)
+    angle *= ratio
+    if abs(y) > abs(x):
+        angle = np.float32(math.pi / 2) - angle
+    if x < 0:
+        angle = np.float32(math.pi) - angle
+    return math.copysign(angle, y)

@@ -84,8 +84,6 @@ _ADVICE = (
     "pansplat-view"
 )
 
-"""For pairs of files, places of the second panorama relative to the first one, best first."""
-
 
 @dataclass(frozen=True, eq=False)
 class PoseGroup:

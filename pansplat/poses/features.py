@@ -23,6 +23,7 @@ from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
+from pansplat.poses.solvers import compiled
 
 _FIELD_OF_VIEW = 100.0  # degrees of a face; 10 more than a cube's
 _CONTRAST, _EDGE = 0.015, 12.0  # thresholds of SIFT; low, because matching removes weak features
@@ -191,25 +192,40 @@ def match_features(first: Features, second: Features) -> Matches:
     if min(len(first), len(second)) < 2:
         return NO_MATCHES
     a, b = torch.from_numpy(first.descriptors), torch.from_numpy(second.descriptors)
-    rows, columns = [], torch.full((2, len(b)), -1.0)  # the two largest similarities of each row, and of each column
-    nearest, row_of = [], torch.zeros(len(b), dtype=torch.long)
+    rows, columns = (np.full((len(each), 2), -1.0, np.float32) for each in (a, b))  # the two largest similarities
+    column_of, row_of = np.zeros(len(a), np.int64), np.zeros(len(b), np.int64)
     for start in range(0, len(a), _CHUNK):
-        similarity = a[start : start + _CHUNK] @ b.T
-        values, index = similarity.topk(2, dim=1)
-        rows.append(values.T)
-        nearest.append(index[:, 0])
-        values, index = similarity.topk(min(2, len(similarity)), dim=0)  # the last chunk can have one row
-        row_of = torch.where(values[0] > columns[0], index[0] + start, row_of)
-        columns = torch.cat((columns, values)).topk(2, dim=0).values
-    index = torch.cat(nearest)
-    mutual = torch.nonzero(row_of[index] == torch.arange(len(index)))[:, 0]
-    distance, row_second = (1 - torch.cat(rows, dim=1)[:, mutual]).clamp_min(0).sqrt()
-    column_second = (1 - columns[1, index[mutual]]).clamp_min(0).sqrt()
-    ratio = (distance / row_second.clamp_min(1e-3) + distance / column_second.clamp_min(1e-3)) / 2
-    indices, ratio = torch.stack((mutual, index[mutual]), dim=1).numpy(), ratio.double().numpy()
+        part = slice(start, start + _CHUNK)
+        _keep_nearest((a[part] @ b.T).numpy(), start, rows[part], column_of[part], columns, row_of)
+    mutual = np.flatnonzero(row_of[column_of] == np.arange(len(a)))
+    indices = np.stack((mutual, column_of[mutual]), axis=1)
+    by_row, by_column = (
+        np.sqrt(np.maximum(1 - two.astype(np.float64), 0)) for two in (rows[mutual], columns[indices[:, 1]])
+    )
+    ratio = 0.5 * by_row[:, 0] * (1 / np.maximum(by_row[:, 1], 1e-3) + 1 / np.maximum(by_column[:, 1], 1e-3))
     order = np.argsort(ratio, kind="stable")
     prior = np.interp(ratio[order], _RATIOS, _PRIORS)
     return drop_repeated(first, second, Matches(indices[order], prior))
+
+
+@compiled
+def _keep_nearest(similarity, start, rows, column_of, columns, row_of):
+    """Update the two largest similarities of rows and columns, and where the largest are, by rows from `start` on."""
+    for i in range(len(similarity)):
+        most, second, place = rows[i, 0], rows[i, 1], column_of[i]
+        for j in range(similarity.shape[1]):
+            value = similarity[i, j]
+            if value > second:
+                if value > most:
+                    most, second, place = value, most, j
+                else:
+                    second = value
+            if value > columns[j, 1]:
+                if value > columns[j, 0]:
+                    columns[j, 0], columns[j, 1], row_of[j] = value, columns[j, 0], start + i
+                else:
+                    columns[j, 1] = value
+        rows[i, 0], rows[i, 1], column_of[i] = most, second, place
 
 
 def drop_repeated(first: Features, second: Features, matches: Matches) -> Matches:

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from pansplat.networks.aliked import Aliked
 from pansplat.networks.lightglue import LightGlue
 from pansplat.networks.weights import load_weights, require_shapes
-from pansplat.poses.features import FACE_ROTATIONS, Matches, are_distinct, render_face, sample_mask
+from pansplat.poses.features import FACE_ROTATIONS, Matches, are_distinct, render_face
 
 _FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no upright direction
 _KEYPOINTS = 640  # of a face
@@ -118,10 +118,8 @@ def detect_learned(
         side = len(pixels) - margin
         pixels = pixels[margin // 2 :][:side, margin // 2 :][:, :side]
         centre = len(pixels) / 2 + margin / 2 - margin // 2  # of the face, in pixels from the corner
-        steps = (np.arange(side) + 0.5 - centre) / focal
-        x, y = np.meshgrid(steps, steps)
-        rays = np.stack((x, y, np.ones_like(x)), axis=-1).reshape(-1, 3) @ rotation.T
-        allowed = torch.from_numpy(sample_mask(mask, rays).reshape(side, side))
+        inside = render_face(mask.astype(np.uint8), rotation, focal)[margin // 2 :][:side, margin // 2 :][:, :side]
+        allowed = torch.from_numpy(inside > 0)
         with torch.inference_mode():
             rgb = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
             found = matcher.aliked(rgb.to(device), allowed.to(device), _KEYPOINTS)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from jaxtyping import Float
 from numpy import ndarray as Array
 
@@ -58,7 +59,7 @@ def propose_by_depth(
     x, y = ((rays * np.exp(depths.log_depth[:, side, None])) @ levels[side].T for side, rays in enumerate((a, b)))
     reach = (_VOTE_WIDTH * np.exp(depths.log_depth).mean(axis=1)).clip(*_VOTE_LIMITS)
     found, singles = [], []
-    for rotation in axes.wall_rotations():
+    for rotation in axes.wall_rotations:
         level = levels[1] @ rotation @ levels[0].T
         translations = y - x @ level.T
         votes, weights = _count_votes(translations, reach, prior)
@@ -135,7 +136,7 @@ def _count_votes(
     translations: Float[Array, "n 3"], reach: Float[Array, "n"], prior: Float[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
     """How many matches state a translation near that of each match, and their weights."""
-    squared = ((translations[:, None] - translations[None]) ** 2).sum(axis=-1)
+    squared = scipy.spatial.distance.cdist(translations, translations, "sqeuclidean")
     weights = np.exp(-0.5 * squared / reach[None] ** 2) * prior
     return weights.sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2), weights
 
@@ -176,7 +177,7 @@ def _vote_pairs(
     translations = middle[1] - np.einsum("nij,nj->ni", rotations, middle[0])
     turns = np.stack((cos, sin), axis=1) / _VOTE_YAW
     points = np.concatenate((translations / _VOTE_LIMITS[1], turns), axis=1)
-    squared = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
+    squared = scipy.spatial.distance.cdist(points, points, "sqeuclidean")
     votes = np.exp(-0.5 * squared).sum(axis=1) * np.exp(-0.5 * (translations[:, 2] / _CLIMB) ** 2)
     found: list[int] = []
     for n in np.argsort(-votes, kind="stable"):

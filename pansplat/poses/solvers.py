@@ -8,12 +8,17 @@ E = [t]x R.
 from __future__ import annotations
 
 import itertools
+import math
+from typing import Any
 
 import numpy as np
-import scipy
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
+from pansplat.system.kernels import cached_njit
+
+compiled: Any = cached_njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+"""Compile a function of numpy arrays."""
 Bearings = Float[Array, "n 3"]
 Rotation = Float[Array, "3 3"]
 Vector = Float[Array, "3"]
@@ -64,11 +69,6 @@ def rotation_exp(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"
     a = np.where(small, 1 - angle**2 / 6, np.sin(safe) / safe)
     b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     return np.eye(3) + a * k + b * (k @ k)
-
-
-def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """The rotation vector, radians, of a rotation matrix."""
-    return scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec()
 
 
 def rotation_angle(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
@@ -224,12 +224,24 @@ def epipolar_angles(a: Bearings, b: Bearings, rotation: Rotation, translation: V
 
     Its square is the Sampson error on the sphere.
     """
-    g = a @ rotation.T
-    e = (cross(translation, g) * b).sum(axis=1)
-    # Gradients by the two bearings, on their tangent planes.
-    by_b = cross(translation, g) - e[:, None] * b
-    by_g = cross(b, translation) - e[:, None] * g
-    return e / np.sqrt(np.maximum((by_b**2).sum(axis=1) + (by_g**2).sum(axis=1), _MIN_SINE))
+    return _epipolar_angles(*(np.ascontiguousarray(each, np.float64) for each in (a, b, rotation, translation)))
+
+
+@compiled
+def _epipolar_angles(a, b, r, t):
+    angles = np.empty(len(a))
+    for i in range(len(a)):
+        x, y, z, bx, by, bz = a[i, 0], a[i, 1], a[i, 2], b[i, 0], b[i, 1], b[i, 2]
+        gx = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
+        gy = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
+        gz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+        px, py, pz = t[1] * gz - t[2] * gy, t[2] * gx - t[0] * gz, t[0] * gy - t[1] * gx
+        qx, qy, qz = by * t[2] - bz * t[1], bz * t[0] - bx * t[2], bx * t[1] - by * t[0]
+        e = px * bx + py * by + pz * bz
+        # Gradients by the two bearings, on their tangent planes: p - e b and q - e g.
+        squared = px * px + py * py + pz * pz + qx * qx + qy * qy + qz * qz - 2 * e * e
+        angles[i] = e / math.sqrt(max(squared, _MIN_SINE))
+    return angles
 
 
 def two_view_depths(a: Bearings, b: Bearings, rotation: Rotation, translation: Vector) -> Float[Array, "n 2"]:

@@ -30,6 +30,7 @@ from pansplat.poses.solvers import (
     Rotation,
     Vector,
     angle_between,
+    compiled,
     cross,
     decompose_essential,
     epipolar_angles,
@@ -175,20 +176,23 @@ class _Evidence:
         A right match by chance also has its point in front of both cameras in about half of all cases, so that a point
         in front has twice the likelihood ratio against chance (uniform on the sphere).
         """
-        angle = np.abs(epipolar_angles(self.a, self.b, rotation, translation))
-        likelihood = np.where(angle < _MAX_ANGLE * _WIDE * self.noise, _density(angle, self.noise), 0.0)
-        points = two_view_depths(self.a, self.b, rotation, translation)
-        parallax = angle_between(self.a @ rotation.T, self.b)
-        ratio = np.where(_are_behind(points, parallax, self.noise), 0.0, 2 * likelihood)
+        every = np.abs(epipolar_angles(self.a, self.b, rotation, translation))
+        near = np.flatnonzero(every < _MAX_ANGLE * _WIDE * self.noise)  # few for a wrong pose
+        angle, a, b, prior, noise = (each[near] for each in (every, self.a, self.b, self.prior, self.noise))
+        points = two_view_depths(a, b, rotation, translation)
+        parallax = angle_between(a @ rotation.T, b)
+        ratio = np.where(_are_behind(points, parallax, noise), 0.0, 2 * _density(angle, noise))
         is_proposed = distance is not None
         if self.depths is not None:
-            weight = np.where((points > 0).all(axis=1), self.prior * ratio / (1 - self.prior + self.prior * ratio), 0.0)
-            distance = self.depths.find_distance(points, weight) if distance is None else distance
+            depths = self.depths.select(near)
+            weight = np.where((points > 0).all(axis=1), prior * ratio / (1 - prior + prior * ratio), 0.0)
+            distance = depths.find_distance(points, weight) if distance is None else distance
             if math.isfinite(distance):
-                ratio = ratio * self.depths.likelihood_ratio(points, distance, parallax, self.noise)
-        total = 1 - self.prior + self.prior * ratio
-        score = float(np.log(total).sum()) + self.axes.score(rotation)
-        found = self.prior * ratio / total
+                ratio = ratio * depths.likelihood_ratio(points, distance, parallax, noise)
+        total = 1 - prior + prior * ratio
+        score = float(np.log1p(-self.prior).sum() + np.log(total / (1 - prior)).sum()) + self.axes.score(rotation)
+        found = np.zeros(len(every))
+        found[near] = prior * ratio / total
         return Hypothesis(rotation, translation, score, found, math.nan if distance is None else distance, is_proposed)
 
     def refine(self, start: Hypothesis, steps: int) -> Hypothesis:
@@ -274,8 +278,10 @@ def _normal_equations(
     a: Array, b: Array, probability: Array, rotation: Array, translation: Array, noise: float | Array
 ) -> tuple[Float[Array, "5 5"], Float[Array, "5"]]:
     """Hessian and gradient of the squared angles in the noise's unit, by rotation (3) and direction (2)."""
+    used = np.flatnonzero(probability > 0)
+    a, b, probability, noise = a[used], b[used], probability[used], np.broadcast_to(noise, len(a))[used]
     linear = _linearise(a, b, rotation, translation)
-    jacobian = linear.by_pose / np.broadcast_to(noise, len(a))[:, None]
+    jacobian = linear.by_pose / noise[:, None]
     angle = np.abs(linear.angle)
     # Weight of the wide component of the noise is smaller, as in an EM step for a mixture of two Gaussians.
     narrow = (1 - _WIDE_SHARE) * np.exp(-0.5 * (angle / noise) ** 2)
@@ -374,7 +380,7 @@ def _sample_essentials(
             chosen = _draw(rng, top, _SAMPLES[size], size)
             rotations, translations = solver(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
             free.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
-        for rotation in axes.wall_rotations():
+        for rotation in axes.wall_rotations:
             chosen = _draw(rng, top, _SAMPLES[2], 2)
             normals = cross(a[chosen] @ rotation.T, b[chosen])
             translations = cross(normals[:, 0], normals[:, 1])
@@ -452,34 +458,42 @@ def _draw(rng: np.random.Generator, top: int, samples: int, size: int) -> Int[Ar
 
 
 def _score_essentials(essential: Float[Array, "n 3 3"], evidence: _Evidence) -> Float[Array, "n"]:
-    """Scores of essential matrices without the signs of the depths, by matrix products.
+    """Scores of essential matrices without the signs of the depths."""
+    a, b = (np.ascontiguousarray(rays.T, np.float32) for rays in (evidence.a, evidence.b))
+    gain = math.sqrt(2 / math.pi) * evidence.prior / (1 - evidence.prior) / evidence.noise
+    scores = _sum_gains(essential.astype(np.float32), a, b, evidence.noise.astype(np.float32), gain)
+    return scores + float(np.log1p(-evidence.prior).sum())
+
+
+@compiled
+def _sum_gains(essentials, a, b, noise, gain):
+    """Sums of log(1 + gain * density) over matches near their epipolar curves; bearings are columns, in float32.
 
     Squared Sampson denominators are |E a|^2 + |E' b|^2, up to the square of the residual.
     """
-    a, b, noise = evidence.a, evidence.b, evidence.noise.astype(np.float32)
-    i, j = np.triu_indices(3)
-    twice = np.where(i == j, 1.0, 2.0)
-    products = (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T.astype(np.float32)
-    squares_a, squares_b = (np.ascontiguousarray((x[:, i] * x[:, j] * twice).T.astype(np.float32)) for x in (a, b))
-    limit = (_MAX_ANGLE * _WIDE * noise) ** 2
-    scores = np.empty(len(essential))
-    odds = evidence.prior / (1 - evidence.prior)
-    narrow, wide = -0.5 / noise**2, -0.5 / (_WIDE * noise) ** 2
-    peak = math.sqrt(2 / math.pi) / noise
-    narrow_peak, wide_peak = peak * (1 - _WIDE_SHARE), peak * _WIDE_SHARE / _WIDE
-    for start in range(0, len(essential), 2048):
-        part = essential[start : start + 2048]
-        residual = part.reshape(-1, 9).astype(np.float32) @ products
-        left = np.einsum("hki,hkj->hij", part, part)[:, i, j].astype(np.float32) @ squares_a
-        right = np.einsum("hik,hjk->hij", part, part)[:, i, j].astype(np.float32) @ squares_b
-        squared = residual * residual / np.maximum(left + right, np.float32(1e-12))
-        hypothesis, match = np.nonzero(squared < limit)
-        angle = squared[hypothesis, match]
-        likelihood = narrow_peak[match] * np.exp(narrow[match] * angle)
-        likelihood += wide_peak[match] * np.exp(wide[match] * angle)
-        gain = np.log1p(odds[match] * likelihood)
-        scores[start : start + len(part)] = np.bincount(hypothesis, gain, len(part))
-    return scores + float(np.log(1 - evidence.prior).sum())
+    scores, squared = np.empty(len(essentials)), np.empty(len(noise), np.float32)
+    limit, tiny = np.float32((_MAX_ANGLE * _WIDE) ** 2), np.float32(1e-12)
+    ax, ay, az, bx, by, bz = a[0], a[1], a[2], b[0], b[1], b[2]
+    for n in range(len(essentials)):
+        e = essentials[n]
+        e00, e01, e02, e10, e11 = e[0, 0], e[0, 1], e[0, 2], e[1, 0], e[1, 1]
+        e12, e20, e21, e22 = e[1, 2], e[2, 0], e[2, 1], e[2, 2]
+        for i in range(len(noise)):
+            x = e00 * ax[i] + e01 * ay[i] + e02 * az[i]
+            y = e10 * ax[i] + e11 * ay[i] + e12 * az[i]
+            z = e20 * ax[i] + e21 * ay[i] + e22 * az[i]
+            u = e00 * bx[i] + e10 * by[i] + e20 * bz[i]
+            v = e01 * bx[i] + e11 * by[i] + e21 * bz[i]
+            w = e02 * bx[i] + e12 * by[i] + e22 * bz[i]
+            residual = x * bx[i] + y * by[i] + z * bz[i]
+            scale = max(x * x + y * y + z * z + u * u + v * v + w * w, tiny)
+            squared[i] = residual * residual / (scale * (noise[i] * noise[i]))
+        scores[n] = 0
+        for i in range(len(noise)):
+            if squared[i] < limit:
+                root = math.exp(-0.5 / _WIDE**2 * squared[i])
+                scores[n] += math.log1p(gain[i] * ((1 - _WIDE_SHARE) * root**9 + _WIDE_SHARE / _WIDE * root))
+    return scores
 
 
 def _pick_distinct(essential: Float[Array, "n 3 3"], scores: Float[Array, "n"], kept: int) -> list[int]:

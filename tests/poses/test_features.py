@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy import ndarray as Array
 
-from pansplat.poses.features import Features, detect_features, match_features
+from pansplat.poses.features import _PRIORS, _RATIOS, Features, detect_features, match_features
 from pansplat.poses.solvers import angle_between
 
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
@@ -64,3 +64,14 @@ def test_matches_do_not_depend_on_the_order_of_the_panoramas(picture: Array) -> 
     found = [set(map(tuple, m)) for m in (there.indices[:200], back.indices[:200, ::-1])]
     assert len(found[0] & found[1]) > 195
     assert np.allclose(there.prior[:200], back.prior[:200], atol=5e-3)
+
+
+def test_matches_are_mutually_nearest_with_the_prior_of_their_ratio(picture: Array) -> None:
+    first, second = detect_features(picture), detect_features(np.roll(picture, 40, axis=1))
+    found = match_features(first, second)
+    similarity = first.descriptors.astype(np.float64) @ second.descriptors.T
+    i, j = found.indices.T
+    assert np.array_equal(similarity[i].argmax(axis=1), j) and np.array_equal(similarity[:, j].argmax(axis=0), i)
+    row, column = (np.sqrt(1 - np.partition(s, -2, axis=1)[:, -2]) for s in (similarity[i], similarity.T[j]))
+    ratio = np.sqrt(np.maximum(1 - similarity[i, j], 0)) * (1 / row + 1 / column) / 2
+    assert found.prior == pytest.approx(np.interp(ratio, _RATIOS, _PRIORS), abs=2e-3)

@@ -8,11 +8,14 @@ import pytest
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.features import Features, Matches
-from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp
+from pansplat.poses.solvers import angle_between, rotation_angle, rotation_exp, skew
 from pansplat.poses.two_view import (
     NO_LINKS,
     LinkDirections,
     RelativePose,
+    _density,
+    _Evidence,
+    _score_essentials,
     estimate_relative_pose,
     polish_pose,
     polish_relative_pose,
@@ -264,3 +267,16 @@ def test_large_features_have_a_small_weight(scene) -> None:
         sizes = np.concatenate((np.ones(40), np.full(120, size)))
         errors.append(max(_polish(mixed, np.full(160, 0.67), sizes)))
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_essential_matrices_have_the_scores_of_the_plain_form(scene) -> None:
+    bearings, rng = scene(4, 900, noise=NOISE, outliers=0.3), np.random.default_rng(0)
+    a, b, prior, noise = bearings.first, bearings.second, rng.uniform(0.01, 0.8, 900), rng.uniform(1e-3, 3e-3, 900)
+    rotations = rotation_exp(3e-3 * rng.normal(size=(20, 3))) @ bearings.rotation
+    essentials = skew(bearings.translation) @ rotations
+    ea, eb = a @ essentials.transpose(0, 2, 1), b @ essentials
+    angle = np.abs((ea * b).sum(axis=2)) / np.sqrt((ea**2).sum(axis=2) + (eb**2).sum(axis=2))
+    likelihood = np.where(angle < 12 * noise, _density(angle, noise), 0.0)
+    expected = np.log(1 - prior + prior * likelihood).sum(axis=1)
+    found = _score_essentials(essentials, _Evidence(a, b, prior, noise, NO_PRIOR))
+    assert found == pytest.approx(expected, abs=0.1) and np.ptp(expected) > 100  # of float32
