@@ -191,10 +191,7 @@ def _normal_equations(bundle: Bundle, state: _State, noise: float) -> tuple[Arra
     offset = x[:, :3] - x[:, 3:] * bundle.centres[bundle.camera]
     by_camera = np.concatenate((world @ skew(offset), -world * x[:, 3][:, None, None]), axis=2)
     by_point = np.concatenate((world, -(world @ bundle.centres[bundle.camera][:, :, None])), axis=2)
-    # Tangents of the unit 4-sphere: three columns of the reflection of a point to the fourth axis.
-    normal = bundle.points + np.copysign((0, 0, 0, 1), bundle.points)
-    bases = np.eye(4) - normal[:, :, None] * normal[:, None] / (1 + np.abs(bundle.points[:, 3:, None]))
-    bases = bases[:, :, :3]
+    bases = np.linalg.svd(bundle.points[:, None, :])[2][:, 1:].transpose(0, 2, 1)  # tangent of the unit 4-sphere
     by_point = by_point @ bases[bundle.point]
     weighted_camera, weighted_point = by_camera * weight[:, None, None], by_point * weight[:, None, None]
     cameras = np.zeros((len(bundle.centres), 6, 6))

@@ -95,6 +95,11 @@ class Surroundings:
         maps = np.dstack((log_depth, deviation, _find_normals(log_depth), *sampled))
         return np.ascontiguousarray(maps, np.float32)
 
+    @functools.cached_property
+    def points(self) -> Float[Array, "h 2*h 3"]:
+        """The surfaces in the frame of the upright camera, camera heights."""
+        return _upright_rays() * np.exp(self.maps[:, :, :1])
+
 
 def overlap_weight(overlap: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Weight of the likeness and the shade of directions with this share of the sphere."""
@@ -127,7 +132,7 @@ def _compare_all(first: Surroundings, second: Surroundings, rotations: Array, tr
     values = np.zeros((len(rotations), 5))
     for (turns, translations), source, target in ((there, first, second), (back, second, first)):
         values += 0.5 * _compare_one_way(
-            _upright_rays(), source.maps, target.maps, turns.astype(np.float32), translations.astype(np.float32), step
+            source.points, source.maps, target.maps, turns.astype(np.float32), translations.astype(np.float32), step
         )
     return values
 
@@ -147,11 +152,10 @@ def _upright_rays() -> Float[Array, "h 2*h 3"]:
 
 
 @compiled
-def _compare_one_way(rays, source, target, rotations, translations, step):
+def _compare_one_way(points, source, target, rotations, translations, step):
     height, width = target.shape[:2]
     count = len(rotations)
     result = np.zeros((count, 5))
-    points = rays[step // 2 :: step, step // 2 :: step] * np.exp(source[step // 2 :: step, step // 2 :: step, :1])
     for n in range(count):
         r, t = rotations[n], translations[n]
         total = common = conflict = 0.0
@@ -159,8 +163,7 @@ def _compare_one_way(rays, source, target, rotations, translations, step):
         for i in range(step // 2, height, step):
             weight = math.cos(((i + 0.5) / height - 0.5) * math.pi)
             for j in range(step // 2, width, step):
-                point = points[i // step, j // step]
-                x, y, z = point[0], point[1], point[2]
+                x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
                 px = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
                 py = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
                 pz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
