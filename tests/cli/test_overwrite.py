@@ -65,7 +65,7 @@ def test_the_folder_of_a_page_keeps_files_of_the_user(scene: Path, tmp_path: Pat
     for count in ("100", "50"):
         assert run(["export", str(scene), "-o", str(out), "--gaussians", count]) == 0
     others = [file for file in own.parent.iterdir() if file != own]
-    assert own.read_bytes() == OWN and len(others) == 2 and all(map(is_written, others)), (
+    assert own.read_bytes() == OWN and len(others) == 3 and all(map(is_written, others)), (
         "parts of the first page are removed"
     )
 

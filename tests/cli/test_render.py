@@ -89,7 +89,7 @@ def test_a_video_has_the_size_that_it_is_looked_at(layout, size, scene: Path, tm
         sizes.append(options["size"])
         return Rendering(torch.zeros(3, 4, 8), torch.zeros(4, 8), torch.zeros(4, 8))
 
-    monkeypatch.setattr(pipeline, "render", record)
+    monkeypatch.setattr(pipeline.drawing, "render", record)
     arguments = ["--layout", layout, "--seconds", "0.1", "--fps", "20"]
     assert run(["render", str(scene), "-o", str(tmp_path / "x.mp4"), *arguments]) == 0
     assert set(sizes) == {size}
@@ -115,7 +115,7 @@ def test_the_camera_stays_at_the_panoramas_of_parts_and_fades_between_them(
         seen.append(torch.as_tensor(pose)[:3, 3])
         return draw(scene, pose, **options)
 
-    monkeypatch.setattr(pipeline, "render", record)
+    monkeypatch.setattr(pipeline.drawing, "render", record)
     for fraction in (None, 0.3, 0.9):
         render(parted_scene, tmp_path / "x.png", *([] if fraction is None else ["--at", fraction]))
     assert run(["render", str(parted_scene), "-o", str(tmp_path / "x.mp4"), "--height", "18", "--fps", "6"]) == 0

@@ -197,7 +197,7 @@ def test_a_command_in_a_compiled_kernel_ends_at_ctrl_c(folder: Path, tmp_path: P
         "        work(2)\n"
         "        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
         "        while True: work(30_000_000)\n"
-        "pipeline._MODELS['slow'] = Slow\n"
+        "pipeline.models._MODELS['slow'] = Slow\n"
         "main(['evaluate', 'pair', '--out', 'report', '--model', 'slow', '--height', '64'])\n"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True)

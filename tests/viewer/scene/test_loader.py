@@ -18,6 +18,7 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
+from pansplat.tours.graph import select_views
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings
@@ -151,7 +152,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
 
     def predict(pair, model, **options):
         used.append(model.name)
-        return load_house(scenes.make_entry((0, 1))).scene
+        return select_views(load_house(scenes.make_entry((0, 1))).scene, range(len(pair.context)))
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     scenes = TourScenes(parted_house)
