@@ -110,7 +110,9 @@ def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "poin
         return np.empty((0, 3))
     head, _, body = read_file(path, limit=_MAX_PLY).partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    columns = [(line[2], "<" + _PLY_TYPES.get(line[1], "")) for line in lines if line[:1] == ["property"]]
+    order = ">" if ["format", "binary_big_endian", "1.0"] in lines else "<"
+    properties = [line for line in lines if line[:1] == ["property"] and len(line) == 3]  # not the lists of faces
+    columns = [(line[2], order + _PLY_TYPES.get(line[1], "")) for line in properties]
     try:
         count = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
         if ["format", "ascii", "1.0"] in lines:

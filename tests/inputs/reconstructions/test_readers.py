@@ -67,7 +67,7 @@ def test_nerfstudio_equirectangular_cameras(
         np.testing.assert_allclose(panorama.cam2world, cameras[NAMES.index(panorama.image.name)], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_points_that_nerfstudio_names_give_near_and_far(
     tmp_path: Path, cameras: list[Array], points: Array, write_panorama, kind: str
 ) -> None:
@@ -78,8 +78,9 @@ def test_points_that_nerfstudio_names_give_near_and_far(
     for name, pose in zip(NAMES, cameras, strict=True):
         write_panorama(tmp_path / name, pose)
     head = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n"
-    head += "".join(f"property {name}\n" for name in ("double x", "double y", "double z", "uchar red")) + "end_header\n"
-    table = np.zeros(len(points), [("xyz", "<f8", 3), ("red", "u1")])
+    head += "".join(f"property {name}\n" for name in ("double x", "double y", "double z", "uchar red"))
+    head += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    table = np.zeros(len(points), [("xyz", ">f8" if kind == "binary_big_endian" else "<f8", 3), ("red", "u1")])
     table["xyz"] = points
     rows = "".join(f"{x} {y} {z} 0\n" for x, y, z in points).encode() if kind == "ascii" else table.tobytes()
     (tmp_path / "points.ply").write_bytes(head.encode() + rows)
