@@ -23,7 +23,7 @@ _PUBLIC = {
     "Rendering": "pansplat.rendering",
     "Scene": "pansplat.gaussians.scene",
     "Views": "pansplat.inputs.views",
-    "estimate_poses": "pansplat.pipeline",
+    "estimate_poses": "pansplat.poses.estimate",
     "load": "pansplat.pipeline",
     "load_model": "pansplat.pipeline",
     "load_pairs": "pansplat.pipeline",

@@ -17,7 +17,7 @@ from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, pr
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.files import require_output_folder, require_replaceable
-from pansplat.system.options import CAMERA_HEIGHT, Positive, Threads
+from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT, Positive, Threads
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from pansplat.evaluation.results import Row
 
 _SAMPLE = Path(pansplat.__file__).parents[1] / "assets" / "living_room"
-_MIN_SWEEP_HEIGHT = 64  # pixels
 _LatticeHeight = Annotated[int, Meta(ge=16, le=4096, multiple_of=8)]
 _WindowSide = Annotated[int, Meta(ge=64, le=8192)]
 
@@ -82,7 +81,7 @@ class BenchRaster(_Options):
             print("without triton: there is no CUDA device")
         groups = raster.list_raster_groups(height, backends, threads)
         if _SAMPLE.is_dir():
-            options = PredictOptions("sweep", height=max(small, _MIN_SWEEP_HEIGHT), refine_steps=0)
+            options = PredictOptions("sweep", height=max(small, MIN_HEIGHT), refine_steps=0)
             scene = predict_scene(choose_pair(_SAMPLE, PairChoice()), options)
             sample = raster.BenchScene(_SAMPLE.stem, lambda: scene.gaussians, scene.pose_between(0.5))
             groups.append(raster.make_sample_group(sample, small, backends, threads))

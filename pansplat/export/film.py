@@ -132,7 +132,6 @@ class Shot:
         pose: of the camera (cam2world), in the world of the scene.
         vertical_fov_degrees: of a perspective image.
         seconds: time of the frame in the fades.
-        edge: of a tour that is flown; None is the one that the camera is at.
         moment: of the route that is followed, if it is one.
         goal: of a zoom, the frame that fades in.
     """
@@ -140,16 +139,20 @@ class Shot:
     pose: Float[np.ndarray, "4 4"]
     vertical_fov_degrees: float
     seconds: float
-    edge: Edge | None = None
     moment: Moment | None = None
     goal: Shot | None = None
+
+    @property
+    def edge(self) -> Edge | None:
+        """The edge of a tour that is flown; None is the one that the camera is at."""
+        return None if self.moment is None else self.moment.step.edge
 
     @staticmethod
     def of_moment(moment: Moment, vertical_fov_degrees: float, seconds: float) -> Shot:
         """The frame of a route."""
         goal = None if moment.arrival is None else Shot(moment.arrival, vertical_fov_degrees, seconds)
         fov = moment.narrowing * vertical_fov_degrees
-        return Shot(moment.pose, fov, seconds, moment.step.edge, moment, goal)
+        return Shot(moment.pose, fov, seconds, moment, goal)
 
 
 def list_flight(

@@ -45,7 +45,7 @@ from pansplat.export.page_data import (
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_files, pack_photographs
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
-from pansplat.geometry.path import find_direction, turn_pose
+from pansplat.geometry.path import find_direction, turn_axes
 from pansplat.inputs.pairs import Pair
 from pansplat.inputs.views import Views
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
@@ -63,7 +63,7 @@ from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, link_parts
 from pansplat.tours.outlook import find_widest
-from pansplat.tours.route import find_angles
+from pansplat.tours.route import find_angles, find_start_angles
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
 PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
@@ -247,9 +247,8 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
     views = tuple(range(len(scene.cam2world)))
     walk = tuple(dict.fromkeys(tour.plan_walk())) if tour.overlaps else views
     start, level = scene.cam2world[walk[0]].clone(), tour.level_axes
-    start[:3, :3] = torch.from_numpy(level)
     yaw, pitch = _find_ahead(tour, facts, walk[0])
-    start = _look(start, level, yaw, pitch)
+    start[:3, :3] = torch.from_numpy(turn_axes(level, yaw, pitch))
     if not tour.overlaps:
         return _Flights(start, level, yaw, pitch, (0,) * len(views), (views,), walk)
     scenes = tour.choose_scene_views()
@@ -270,8 +269,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
 
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
     """Yaw and pitch of the start view of a panorama, else of its widest view."""
-    start = tour.find_start_view(view)
-    return (find_widest(facts.outlooks[view]), 0.0) if start is None else find_angles(tour.level_axes.T @ start)
+    return find_start_angles(tour, view) or (find_widest(facts.outlooks[view]), 0.0)
 
 
 def _order_views(scene: Scene, flights: _Flights) -> list[int]:
@@ -279,12 +277,6 @@ def _order_views(scene: Scene, flights: _Flights) -> list[int]:
     distances = (scene.cam2world[:, :3, 3] - flights.start[:3, 3]).norm(dim=1).numpy()
     parts = np.array(flights.parts)
     return np.lexsort((distances, parts != parts[distances.argmin()])).tolist()
-
-
-def _look(pose: Float[Tensor, "4 4"], level: Float[np.ndarray, "3 3"], yaw: float, pitch: float) -> Tensor:
-    """The pose (4, 4) with the same position that looks in the direction of two angles, relative to `level`."""
-    turned = turn_pose(pose, yaw, torch.from_numpy(-level[:, 1]))
-    return turn_pose(turned, pitch, -turned[:3, 0])
 
 
 def _prepare(scene: Scene) -> Scene:

@@ -18,4 +18,3 @@ from pansplat.pipeline.prediction import (
     run_refinement,
 )
 from pansplat.pipeline.tours import choose_predictor, find_max_views, fit_to_scene, predict_tour, warn_of_single_views
-from pansplat.poses.estimate import estimate_poses

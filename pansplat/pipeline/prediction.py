@@ -39,9 +39,9 @@ from pansplat.tours.graph import find_tours, list_starts
 _DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
 _MAX_CACHED_HEIGHT = 512  # rows of a network's prediction that is cached; taller ones are written tile by tile
 _MAX_COLOR = 1.5  # largest value of images in [0, 1], which filters may exceed; images of 8 bits have larger ones
-_REFINE_STEPS = 40  # steps that take about 10 s of a pair on two cores; more change little
-_JOINT_STEPS, _MIN_STEPS = 80, 8  # steps of joint drawing, about 20 s; least for each photograph (docs/refinement.md)
-_STEP_SECONDS = 0.25  # time of a step on two cores
+_REFINE_STEPS = 40  # default steps of layers; more change little (docs/refinement.md)
+_JOINT_STEPS, _MIN_STEPS = 80, 8  # default steps of joint drawing, and the least for each photograph
+_STEP_SECONDS = 0.25  # time of a step on two cores, photographs of 512 rows
 
 
 @with_device
@@ -182,7 +182,8 @@ def refine(
 
     Args:
         scene: of one input camera for each photograph.
-        views: the photographs, such as `pair.load_context(height)`; masked pixels are not compared.
+        views: the photographs, such as `pair.load_context(2 * scene.height)`: those of the scene's height do not show
+            what larger pictures do (docs/refinement.md). Masked pixels are not compared.
         steps: number of steps, by default `choose_refine_steps`; the result is the same in every run.
         seconds: limit after which the run ends early, with a warning; the result depends on the speed of the machine.
         config: settings of the objective, the step sizes and the number of Gaussians.

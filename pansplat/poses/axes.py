@@ -171,7 +171,8 @@ class RotationPrior:
 
     def _turn_from_walls(self, rotation: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
         """The smallest rotation from one with parallel walls to this one, for known walls."""
-        nearest = (self.wall_rotations.reshape(4, 9) @ rotation.reshape(9)).argmax()  # by the cosine of the angle
+        # The trace of a relative rotation grows with the cosine of its angle.
+        nearest = (self.wall_rotations.reshape(4, 9) @ rotation.reshape(9)).argmax()
         return self.wall_rotations[nearest].T @ rotation
 
     def residual(self, rotation: Float[Array, "3 3"]) -> tuple[Float[Array, "n"], Float[Array, "n 3"]] | None:

@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.poses.depth import DepthMap, sample_nearest
 from pansplat.poses.solvers import compiled
+from pansplat.system.kernels import fast_atan2
 
 _HEIGHT = 96  # rows of the maps that are compared
 _COARSE, _FINE = 4, 2  # of many poses, every fourth or second row and column are compared
@@ -172,8 +173,8 @@ def _compare_one_way(points, source, target, rotations, translations, step):
                 distance = math.sqrt(flat + py * py)
                 if distance < _NEAREST:
                     continue
-                column = min(int((_arctan2(px, pz) / (2 * math.pi) + 0.5) * width), width - 1)
-                row = min(max(int((_arctan2(py, math.sqrt(flat)) / math.pi + 0.5) * height), 0), height - 1)
+                column = min(int((fast_atan2(px, pz) / (2 * math.pi) + 0.5) * width), width - 1)
+                row = min(max(int((fast_atan2(py, math.sqrt(flat)) / math.pi + 0.5) * height), 0), height - 1)
                 uncertain = source[i, j, 1] + target[row, column, 1]
                 error = math.log(distance) - target[row, column, 0]
                 if abs(error) < _TOLERANCE + uncertain:
@@ -206,20 +207,3 @@ def _compare_one_way(points, source, target, rotations, translations, step):
                         hue[m] += squares[m]
             result[n, 4] = hue[2] / (math.sqrt(max(hue[0] * hue[1], 0.0)) + _LEAST_HUE**2)
     return result
-
-
-@compiled
-def _arctan2(y, x):
-    """The angle of a vector within 1e-5 radians. Source: C. Hastings, Approximations for Digital Computers, 1955."""
-    high, low = max(abs(x), abs(y)), min(abs(x), abs(y))
-    ratio = low / max(high, np.float32(1e-30))
-    square = ratio * ratio
-    angle = np.float32(-0.0117212)
-    for factor in (0.05265332, -0.11643287, 0.19354346, -0.33262347, 0.99997726):
-        angle = angle * square + np.float32(factor)
-    angle *= ratio
-    if abs(y) > abs(x):
-        angle = np.float32(math.pi / 2) - angle
-    if x < 0:
-        angle = np.float32(math.pi) - angle
-    return math.copysign(angle, y)

@@ -73,6 +73,11 @@ class Photograph:
         whole = PixelWeights.from_mask(mask)
         return cls(image, whole, PixelWeights.from_mask(mask & ~held_out), whole.pixels * held_out)
 
+    def shrink(self, height: int) -> Float[Tensor, "4 height width"]:
+        """The image and, as the last channel, the share of unmasked pixels, by area average."""
+        maps = torch.cat((self.image, (self.unmasked.pixels > 0)[None].to(self.image)))
+        return functional.interpolate(maps[None], (height, 2 * height), mode="area")[0]
+
 
 def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeights) -> Float[Tensor, ""]:
     """Mean absolute error of the colours, plus the mean of those of the gradients to the right and downwards."""
@@ -88,14 +93,16 @@ def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeigh
 
 
 def compare_places(
-    drawn: Rendering, pose: Float[Tensor, "4 4"], photographs: Sequence[tuple[Photograph, Float[Tensor, "4 4"]]]
+    drawn: Rendering,
+    pose: Float[Tensor, "4 4"],
+    photographs: Sequence[tuple[Float[Tensor, "4 height width"], Float[Tensor, "4 4"]]],
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
     """How much the colours of a panorama differ from those that photographs show at its surfaces.
 
     Args:
         drawn: the panorama.
         pose: of its camera.
-        photographs: each with its pose.
+        photographs: each of `Photograph.shrink` at the panorama's size, with its pose.
 
     Returns:
         The least mean absolute difference from a photograph, and the solid angle of each pixel, which is 0 without a
@@ -105,10 +112,9 @@ def compare_places(
     rays = pixel_directions(height, width, dtype=torch.float64, device=drawn.depth.device)
     points = (rays * drawn.depth[..., None]) @ pose[:3, :3].T.to(rays) + pose[:3, 3].to(rays)
     least = torch.full_like(drawn.depth, math.inf)
-    for photograph, camera in photographs:
+    for maps, camera in photographs:
         uv = uv_from_directions((points - camera[:3, 3].to(rays)) @ camera[:3, :3].to(rays))
-        maps = torch.cat((photograph.image, (photograph.unmasked.pixels > 0)[None].to(photograph.image)))
-        *color, unmasked = sample_equirect(functional.interpolate(maps[None], (height, width), mode="area")[0], uv)
+        *color, unmasked = sample_equirect(maps, uv)
         difference = (drawn.color - torch.stack(color)).abs().mean(0)
         least = torch.minimum(least, torch.where(unmasked > 0.999, difference, math.inf))
     is_compared = (drawn.alpha > 0.5) & least.isfinite()

@@ -164,6 +164,7 @@ class Refinement:
             Photograph.split(image, mask > 0.999, held_out, random)
             for image, mask in zip(self._shrink(equal), self._shrink(compared[:, None].float())[:, 0], strict=True)
         ]
+        self._small = [photograph.shrink(_HALF_WAY_HEIGHT) for photograph in self._photographs]
         self._views = {}
         for view in torch.unique(gaussians.views).tolist():
             near = nearest_views(poses, view, 1)
@@ -328,7 +329,7 @@ class Refinement:
             neighbours = {tuple(sorted((view, *nearest_views(poses, view, 1)))) for view in layer.views}
             for (first, second), fraction in itertools.product(sorted(neighbours), (0.25, 0.5, 0.75)):
                 pose = interpolate_poses(poses[first], poses[second], fraction)
-                photographs = [(self._photographs[view], poses[view]) for view in (first, second)]
+                photographs = [(self._small[view], poses[view]) for view in (first, second)]
                 difference, area = compare_places(rasterize(gaussians, pose, size=size), pose, photographs)
                 error, weight = error + float((difference * area).sum()), weight + float(area.sum())
         return error / weight if weight > 0 else 0.0

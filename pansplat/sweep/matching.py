@@ -29,7 +29,7 @@ import numpy as np
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.sweep.surface import pad_sphere, ray_grid
-from pansplat.system.kernels import cached_njit, parallel_for, thread_count
+from pansplat.system.kernels import cached_njit, fast_atan2, parallel_for, thread_count
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
 _BATCH = 8  # hypotheses that a thread processes together
@@ -75,23 +75,6 @@ class MatchingConfig:
     """Cosine (120 degrees) at which it is full."""
 
 
-@nb.njit(fastmath=True, inline="always")
-def _fast_atan2(y, x):
-    """atan2 within 2e-6 radians, by a polynomial that vectorises."""
-    ax, ay = abs(x), abs(y)
-    small, large = min(ax, ay), max(ax, ay)
-    a = small / max(large, np.float32(1e-30))
-    s = a * a
-    p = np.float32(-0.01172120) * s + np.float32(0.05265332)
-    p = p * s - np.float32(0.11643287)
-    p = p * s + np.float32(0.19354346)
-    p = p * s - np.float32(0.33262347)
-    r = (p * s + np.float32(0.99997726)) * a
-    r = np.float32(math.pi / 2) - r if ay > ax else r
-    r = np.float32(math.pi) - r if x < 0 else r
-    return -r if y < 0 else r
-
-
 @cached_njit(fastmath=True, nogil=True, error_model="numpy")
 def _project_row(rays, rotation, translation, inverse, height, width, u, v, scale, cosine):
     """For one row: padded pixel coordinates in the other view, ratio of inverse depths, cosine between the two rays."""
@@ -102,8 +85,8 @@ def _project_row(rays, rotation, translation, inverse, height, width, u, v, scal
         y = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz + rho * translation[1]
         z = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz + rho * translation[2]
         flat = x * x + z * z
-        u[j] = (_fast_atan2(x, z) * np.float32(0.5 / math.pi) + np.float32(0.5)) * width + np.float32(0.5)
-        v[j] = (_fast_atan2(y, math.sqrt(flat)) * np.float32(1 / math.pi) + np.float32(0.5)) * height + np.float32(0.5)
+        u[j] = (fast_atan2(x, z) * np.float32(0.5 / math.pi) + np.float32(0.5)) * width + np.float32(0.5)
+        v[j] = (fast_atan2(y, math.sqrt(flat)) * np.float32(1 / math.pi) + np.float32(0.5)) * height + np.float32(0.5)
         scale[j] = np.float32(1) / math.sqrt(max(flat + y * y, np.float32(1e-12)))
         along = rho * (x * translation[0] + y * translation[1] + z * translation[2])
         cosine[j] = (flat + y * y - along) * scale[j]

@@ -7,6 +7,7 @@ import contextlib
 import gc
 import inspect
 import itertools
+import math
 import os
 import sys
 import threading
@@ -97,6 +98,26 @@ def _inline(function: Callable[..., Any], **options: Any) -> Any:
     compiled: Any = nb.njit(**options)(inspect.unwrap(function))
     share_literal_versions(compiled)
     return compiled
+
+
+@nb.njit(fastmath=True, inline="always")
+def fast_atan2(y, x):
+    """atan2 within 2e-6 radians, by a polynomial that vectorises.
+
+    Source: C. Hastings, Approximations for Digital Computers, 1955.
+    """
+    ax, ay = abs(x), abs(y)
+    small, large = min(ax, ay), max(ax, ay)
+    a = small / max(large, np.float32(1e-30))
+    s = a * a
+    p = np.float32(-0.01172120) * s + np.float32(0.05265332)
+    p = p * s - np.float32(0.11643287)
+    p = p * s + np.float32(0.19354346)
+    p = p * s - np.float32(0.33262347)
+    r = (p * s + np.float32(0.99997726)) * a
+    r = np.float32(math.pi / 2) - r if ay > ax else r
+    r = np.float32(math.pi) - r if x < 0 else r
+    return -r if y < 0 else r
 
 
 @contextlib.contextmanager

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 from shapely.geometry import Polygon
 
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys, choose_camera_height
+from pansplat.tours.floor import assign_storeys
 from pansplat.tours.plan import Plan
 
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
@@ -36,7 +37,7 @@ class Rooms:
     houses: tuple[tuple[int, ...], ...]
     plan: Plan
 
-    @property
+    @cached_property
     def hosts(self) -> tuple[int, ...]:
         """The house that each house is shown beside, by its links; itself if it stands apart."""
         of_view = {view: number for number, views in enumerate(self.houses) for view in views}
@@ -56,7 +57,7 @@ class Rooms:
 
 def find_rooms(facts: TourFacts) -> Rooms:
     """The rooms of a scene of all panoramas: those of the floor plan."""
-    tour, plan, unit = facts.tour, facts.plan, choose_camera_height(facts.heights, facts.tour.far)
+    tour, plan = facts.tour, facts.plan
     outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
     enclosed = {view for room in plan.rooms if room.is_closed for view in room.panoramas}
@@ -69,8 +70,8 @@ def find_rooms(facts: TourFacts) -> Rooms:
     return Rooms(
         tour.level_axes,
         tour.positions,
-        np.array([height or unit for height in facts.heights]),
-        np.array([ceiling or _USUAL_CEILING * unit for ceiling in facts.ceilings]),
+        np.array(facts.usual_heights),
+        np.array([ceiling or _USUAL_CEILING * plan.camera_height for ceiling in facts.ceilings]),
         tuple(outlines),
         tuple(houses),
         plan,

@@ -17,14 +17,15 @@ from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.tours.surfaces import Surfaces
 
 POOR = 0.16  # largest share of a good flight's pictures that shows things twice; by the eye (docs/web.md)
-_ROWS = 64  # of the panoramas of points
-_PLACES = (0.25, 0.5, 0.75)  # of the way
-_AHEAD = math.cos(math.radians(40))  # of the angle from the way, that the pictures of a flight show
-_OTHER_DEPTH, _OTHER_COLOR = 0.1, 0.1  # differences of the logarithms of depths, and of colours in [0, 1]
-_SURFACE = 1.05  # largest ratio of the depths of the points of one pixel that are of its nearest surface
-_COSINE = math.cos(math.radians(3))  # of the Gaussians around the direction of the other camera
-_SHARE = 0.98  # of them on a wall; others are seen beyond a door, or stray
-_DEPTH = 0.95  # of the distance of the other camera, the largest depth of a wall
+_ROWS = 64  # rows of the panoramas in which places are drawn as points
+_PLACES = (0.25, 0.5, 0.75)  # places of a flight whose pictures are judged, fractions of the way
+_AHEAD = math.cos(math.radians(40))  # least cosine of directions from the way that the pictures of a flight show
+# Least differences of what is seen twice: of the logarithms of depths, and of colours in [0, 1], mean over channels.
+_OTHER_DEPTH, _OTHER_COLOR = 0.1, 0.1
+_SURFACE = 1.05  # largest depth of a pixel's points that are of its nearest surface, relative to the nearest point
+_COSINE = math.cos(math.radians(3))  # least cosine of Gaussians around the direction of the other camera
+_SHARE = 0.98  # share of those Gaussians that a wall has in front of the other camera; others stray
+_DEPTH = 0.95  # largest depth of a wall, relative to the distance of the other camera
 
 _Points = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]  # places and colours
 

@@ -46,23 +46,16 @@ def find_link_ring(
         height: of the camera over the floor, metres.
         outlook: of `measure_outlook` at the first node, in the level axes of the tour; zeros and None are unknown.
     """
-    along, direction = _find_level_direction(tour, start, end), tour.find_direction(start, end)
-    if along is None or direction is None:
+    direction, down = tour.find_direction(start, end), tour.level_axes[:, 1]
+    if direction is None:
         return None
-    down = tour.level_axes[:, 1]
-    slope = float(direction @ down) / float(direction @ along)
+    flat = direction - (direction @ down) * down
+    length = float(np.linalg.norm(flat))
+    if length < _MIN_LEVEL:
+        return None
+    along, slope = flat / length, float(direction @ down) / length
     right, _, forward = tour.level_axes.T @ along
     wall = _WALL_METRES if outlook is None else float(outlook[find_bin(math.atan2(right, forward))]) or _WALL_METRES
     if slope * wall < height:
         return wall * (along + slope * down)
     return max(height / slope, _NEAREST_METRES) * along + height * down
-
-
-def _find_level_direction(tour: TourGraph, start: int, end: int) -> Float[np.ndarray, "3"] | None:
-    """The level unit direction of a link; None without one, or if it is vertical."""
-    direction = tour.find_direction(start, end)
-    if direction is None:
-        return None
-    flat = direction - (direction @ tour.level_axes[:, 1]) * tour.level_axes[:, 1]
-    length = float(np.linalg.norm(flat))
-    return None if length < _MIN_LEVEL else flat / length

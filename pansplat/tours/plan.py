@@ -140,7 +140,7 @@ class Plan:
         """Where the plan shows places around a panorama, to the right and forward of the level axes."""
         return self.drawn[node].move(places) if node in self.drawn else places
 
-    @property
+    @cached_property
     def turns(self) -> list[float]:
         """For each world the angle, anticlockwise, by which it is turned so that its longest wall is horizontal."""
         worlds, turns = self.tour.worlds, []

@@ -22,18 +22,18 @@ from pansplat.tours.outlook import find_widest
 FADE_SECONDS = 1.0
 NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
 STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
-STOP_SECONDS = 0.2  # of the fade between scene and photograph
-REST_SECONDS = 3.0  # at each panorama of a flight through a tour
-TURN_SECONDS, TURN_DEGREES = 0.4, 45.0  # of a turn by this angle or more; smaller ones are shorter
+STOP_SECONDS = 0.2  # duration of the fade between scene and photograph
+REST_SECONDS = 3.0  # time at each panorama of a flight through a tour
+TURN_SECONDS, TURN_DEGREES = 0.4, 45.0  # time of a turn by at least that angle; a smaller turn takes less
 ZOOM_SECONDS = 0.7
-_END_SECONDS = 0.1  # at the end of a zoom, so that a route ends in the scene of its last panorama
-ZOOM = 2 / 3  # of the field of view, at the end of a zoom
+_END_SECONDS = 0.1  # rest after a zoom, so that a route ends in the scene of its last panorama
+ZOOM = 2 / 3  # field of view at the end of a zoom, relative to that at its start
 LOWEST_PITCH = -0.2  # radians, the pitch towards a link, which may be on the floor
-FLIGHT_SECONDS = 1.0, 1.6  # the least and the most of a flight
-SHORT_FLIGHT, METRE_SECONDS = 2.0, 0.1  # metres of a flight of the least time, and seconds for each further metre
-_NEAR = 1.0  # metres to the first panorama, below which the camera keeps its heading
-COVERED = 0.1  # of a flight, from either end: there is the photograph, which fades over as much
-SURFACES, MOST_BESIDE = 2.5, 0.4  # usual distance of surfaces, metres, and the most of it from a photograph's camera
+FLIGHT_SECONDS = 1.0, 1.6  # least and largest duration of a flight
+SHORT_FLIGHT, METRE_SECONDS = 2.0, 0.1  # longest flight of the least duration, metres; time of each further metre
+_NEAR = 1.0  # distance of the first panorama below which the camera keeps its heading, metres
+COVERED = 0.1  # share of a flight, from either end, that shows the photograph; it fades over as much again
+SURFACES, MOST_BESIDE = 2.5, 0.4  # usual distance of surfaces, metres; largest part of it beside a photograph's camera
 
 Kind = Literal["turn", "flight", "zoom", "rest"]
 
@@ -181,7 +181,7 @@ def plan_route(
         is_visit = rest > 0 and node not in walk[:number] and (start is None or len(planner.steps) > 0)
         has_zoomed = len(planner.steps) > 0 and planner.steps[-1].kind == "zoom"
         if (is_visit or number == len(walk) - 1) and not has_zoomed:
-            planner.turn(planner.find_start_view(node))
+            planner.turn(find_start_angles(tour, node))
         if is_visit:
             planner.add("rest", planner.camera, rest)
     if not planner.steps or planner.steps[-1].kind == "zoom":
@@ -204,7 +204,8 @@ class _Planner:
         """Stand at a pose, or at the first panorama."""
         if start is None:
             ahead = self.find_way(walk[0], walk[1]) if len(walk) > 1 else None
-            self.camera = np.array((*self.places[walk[0]], *(self.find_start_view(walk[0]) or ahead or (0.0, 0.0))))
+            view = find_start_angles(self.tour, walk[0]) or ahead or (0.0, 0.0)
+            self.camera = np.array((*self.places[walk[0]], *view))
         else:
             self.camera = np.array((*self.level.T @ start[:3, 3], *find_angles(self.level.T @ start[:3, 2])))
         distances = np.linalg.norm(self.places - self.camera[:3], axis=1)
@@ -266,14 +267,15 @@ class _Planner:
             right, _, forward = -(self.level.T @ back)
             return math.atan2(right, forward), 0.0
         is_known = self.tour.worlds[start] == self.tour.worlds[end] or end not in self.outlooks
-        return self.find_start_view(end) or (
+        return find_start_angles(self.tour, end) or (
             self.camera[3:].tolist() if is_known else (find_widest(self.outlooks[end]), 0.0)
         )
 
-    def find_start_view(self, node: int) -> tuple[float, float] | None:
-        """Yaw and pitch of the view that a visitor of a panorama sees first."""
-        view = self.tour.find_start_view(node)
-        return None if view is None else find_angles(self.level.T @ view)
+
+def find_start_angles(tour: TourGraph, node: int) -> tuple[float, float] | None:
+    """Yaw and pitch, in level axes, of the view that a visitor of a panorama sees first; None if none is stated."""
+    view = tour.find_start_view(node)
+    return None if view is None else find_angles(tour.level_axes.T @ view)
 
 
 def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:

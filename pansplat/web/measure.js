@@ -10,7 +10,7 @@ const SVG = byId("marks").namespaceURI;
 const SINGLE_ERROR = 0.35; // of a distance in a panorama alone: heights of cameras over the floor differ by as much
 const NEAREST = 0.02; // z of the ends of a line, of the distance of its farther end
 
-export function drawSvg(tag, attributes, text = "") {
+function drawSvg(tag, attributes, text = "") {
   const element = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
   element.textContent = text;

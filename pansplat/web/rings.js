@@ -1,7 +1,7 @@
 // The panoramas that can be visited: rings in the picture, arrows at its border, the list, and the name of the one at the camera.
 
 import { nodeHere, tangentOf } from "./camera.js";
-import { chooseRings, isCovered } from "./choices.js";
+import { chooseRings, findLink, isCovered } from "./choices.js";
 import { isInDoll, placeInDoll } from "./doll.js";
 import { byId, canvas, make } from "./dom.js";
 import { goTo } from "./flight.js";
@@ -35,7 +35,7 @@ function update() {
   chosenFor = here;
   chosen = chooseRings(here).map(({ node, link }) => rings.find((ring) => ring.node === node && ring.link === link));
   for (const ring of chosen) {
-    const { name } = HEADER.spots[ring.node], link = HEADER.links.find(({ from, to }) => to === ring.node && from === here);
+    const { name } = HEADER.spots[ring.node], link = findLink(here, ring.node);
     ring.text.textContent = link && link.text !== name ? link.text : "";
     ring.button.title = ["Go to", name, ring.text.textContent].join(" ").trim();
     ring.button.ariaLabel = ring.button.title;

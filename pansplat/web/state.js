@@ -17,26 +17,31 @@ export const camera = makeStart();
 export const shown = HEADER.views.map(() => 0);
 
 export const state = {
+  // At the camera; `fade`: from the views of another group.
   edge: 0,
   group: edges.length ? edges[0][2] : 0,
-  fade: null, // at the camera; `fade`: from the views of another group
+  fade: null,
+  // Views whose data is requested, those whose data is there, and those whose data does not arrive and is still tried.
   requested: new Set(),
-  received: new Set(), // views whose data is loaded, and is there
-  missing: new Set(), // those that do not arrive; they are still tried
+  received: new Set(),
+  missing: new Set(),
+  // The last order of the worker (sorter.js).
   sorted: null,
-  isSorting: false, // the last order of the worker (sorter.js)
+  isSorting: false,
   renderer: null, // null while the graphics are lost
+  // Of the picture: whether it is old, its scale, and when it changed last.
   isDirty: true,
   drawnScale: 0,
-  lastChange: 0, // of the picture
+  lastChange: 0,
+  // flight.js
   flight: null,
   isTouring: false,
-  still: null, // flight.js
+  still: null,
   doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: 0 },
   headset: { session: null, turnTo(_yaw) {} }, // xr.js
   here: null, // the panorama at the camera of the last frame
-  step: [0, 0, 0],
-  isFast: false, // of the keys that are held: right, up, forward
+  step: [0, 0, 0], // right, up and forward, by the keys that are held
+  isFast: false,
 };
 
 export function changed() {

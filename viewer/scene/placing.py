@@ -139,7 +139,8 @@ class Placing:
         """The panoramas that are moved, that which is placed first; its group moves with it to another group."""
         assert self.node is not None
         own = self.group_of(self.node)
-        return (self.node, *(other for other in own if other != self.node and not set(own) & set(self.targets)))
+        is_inside = not set(own).isdisjoint(self.targets)
+        return (self.node, *(() if is_inside else (other for other in own if other != self.node)))
 
     def start(self, node: int, targets: Nodes | None = None) -> None:
         """Place a panorama beside others; `targets` are one of `list_targets`, by default the first."""

@@ -217,14 +217,12 @@ class Stage:
     def _draw_stop(self) -> tuple[moderngl.Texture | None, moderngl.Texture | None]:
         """The photograph of the panorama at which the camera stands, or stood until now; of a zoom, both."""
         state, fade, moment = self._state, self.fade, self._state.moment
-        is_zoom = moment is not None and moment.arrival is not None
-        if moment is not None and self._shows_stops and (is_zoom or self.photograph is None):
+        if moment is not None and self._shows_stops and (moment.arrival is not None or self.photograph is None):
             self.stop.follow(moment, state.now)
         else:
-            index = self.photographs.find_stop(np.asarray(state.camera.position)) if self._shows_stops else None
-            index = (
-                None if index is None or self.photograph is not None or self.get_photograph(index) is None else index
-            )
+            may_stop = self._shows_stops and self.photograph is None
+            index = self.photographs.find_stop(np.asarray(state.camera.position)) if may_stop else None
+            index = None if index is None or self.get_photograph(index) is None else index
             was_shown = fade.compute_weight(state.now) < 1 and fade.contents[1 - fade.front] == index
             self.stop.update(index, state.now, at_once=was_shown)
         photograph = None if self.stop.index is None else self.get_photograph(self.stop.index)
