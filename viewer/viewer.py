@@ -238,11 +238,17 @@ class Viewer:
 
     def _pick(self, place: tuple[float, float]) -> PickedPoint | None:
         """The point of the scene at a place of the image; None, and a message, if there is none."""
-        state, stage, scene = self.state, self.stage, self.stage.slot.scene
-        if scene is None or stage.photograph is not None:
+        state, stage = self.state, self.stage
+        if stage.slot.scene is None or stage.photograph is not None:
             return None
         pixel = place[0] * stage.size[0], place[1] * stage.size[1]
-        point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, stage.size), state.settings)
+        ray = compute_pixel_ray(state.camera, pixel, stage.size)
+        stage.slot.image = None  # its texture may hold another image afterwards
+        try:
+            point = pick_point(stage.renderer, *ray, state.settings)
+        except DRAW_ERRORS as error:
+            self.show_error(describe_error(error))
+            return None
         if point is None:
             state.show_message("no Gaussian there")
         return point

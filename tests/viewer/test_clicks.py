@@ -518,10 +518,10 @@ def test_resolution_is_lower_while_the_camera_moves(user, monkeypatch):
     io = imgui.get_io()
     io.add_key_event(imgui.Key.w, True)
     user.draw_frames(8)
-    assert user.viewer.stage.renderer.stats.size[0] < SIZE[0]
+    assert user.viewer.stage.slot._key[-1].scale < 1
     io.add_key_event(imgui.Key.w, False)
     user.settle()
-    assert user.viewer.stage.renderer.stats.size == SIZE
+    assert user.viewer.stage.slot._key[-1].scale == 1
 
 
 def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):

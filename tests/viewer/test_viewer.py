@@ -61,7 +61,7 @@ class NoRenderer:
     def upload(self, scene: Scene, prepared: object = None) -> None:
         if (error := NoRenderer.refuse(scene)) is not None:
             raise error
-        self.stats = FrameStats(total=len(scene.gaussians))
+        self.stats = FrameStats()
 
     def render(self, cam2world: np.ndarray, size: tuple[int, int], settings: Any, *, wait: bool = True) -> Mock:
         if NoRenderer.problem is not None:
@@ -69,14 +69,14 @@ class NoRenderer:
         before = settings if not self.scales else self.last
         self.scales.append(settings.scale)
         self.last = settings  # as a GPU, the time that is known is that of the image before
-        self.stats = replace(self.stats, size=size, frame_ms=1.0, timed=before)
+        self.size, self.stats = size, FrameStats(frame_ms=1.0, timed=before)
         return Mock()
 
     def read_color(self) -> np.ndarray:
-        return np.zeros((*SIZE[::-1], 4), np.float32)
+        return np.zeros((*self.size[::-1], 4), np.float32)
 
     def read_depth(self) -> np.ndarray:
-        return np.full(SIZE[::-1], 3.0, np.float32)
+        return np.full(self.size[::-1], 3.0, np.float32)
 
     has_faces = draw_faces = release = lambda self, *_: None
 

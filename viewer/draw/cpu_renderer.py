@@ -6,10 +6,9 @@ read from cube faces that are kept for the position.
 
 from __future__ import annotations
 
-import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -19,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt32
 
-from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.rendering.cpu.display import (
@@ -28,7 +26,6 @@ from pansplat.rendering.cpu.display import (
     DisplayScene,
     Layers,
     PixelFaces,
-    Selection,
     SelectionCache,
     blend_layers,
     blend_to_pixels,
@@ -41,7 +38,7 @@ from pansplat.system.kernels import checking_each_item, pooled_empty
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
-from pansplat_viewer.draw.splats import Splats, drop_not_finite
+from pansplat_viewer.draw.splats import Splats, drop_not_finite, select_in_view
 from pansplat_viewer.scene.background import BackgroundWorker, Report
 from pansplat_viewer.scene.camera import Pinhole
 from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
@@ -53,7 +50,6 @@ if TYPE_CHECKING:
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
-_SHIFT_STEPS = 20  # a metre, to which the movement of an exposure is rounded up, so that selections serve several
 _MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4
@@ -155,12 +151,11 @@ class CpuRenderer:
         self._stop()
         prepared = prepared or self.prepare(scene)
         self._splats, self._scene = prepared.splats, prepared.scene
-        splats = prepared.splats
         self._groups.clear()
         self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
-        self.stats = FrameStats(total=len(splats))
+        self.stats = FrameStats()
 
     def render(
         self,
@@ -215,14 +210,8 @@ class CpuRenderer:
         if frame.storage != LayerStorage.PADDED_FACES:
             return
         stored = self._find_face_set(frame)
-        faces = [face for face in dict.fromkeys([*stored.find_missing(frame), *range(6)]) if face not in stored.done]
-
-        def draw() -> None:
-            for face in faces:
-                self._draw_face(frame, stored, face)
-
-        if faces:
-            self._start(draw)
+        if len(stored.done) < 6:
+            self._start(lambda: self._draw_faces(frame, stored, [*stored.find_missing(frame), *range(6)]))
 
     def _create_cached_frame(
         self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
@@ -288,7 +277,7 @@ class CpuRenderer:
         focal = frame.focal if frame.settings.layout == "pinhole" else 0.0
         plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), focal)
         layers = self._rasterize(frame, groups, plane, self._selected)
-        sums, drawn = layers.sums, layers.statistics.visible
+        sums = layers.sums
         stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
@@ -296,8 +285,7 @@ class CpuRenderer:
         stages["blend"] = 1e3 * (time.perf_counter() - before)
         pixels = _enlarge(frame, pixels, stages)
         now = time.perf_counter()
-        stats = self._make_stats(frame, drawn, 1e3 * (now - start), stages)
-        return _Picture(frame, pixels, groups, sums, stats)
+        return _Picture(frame, pixels, groups, sums, _make_stats(1e3 * (now - start), stages))
 
     def _rasterize(
         self, frame: Frame, groups: _Groups, plane: ImagePlane, cache: SelectionCache | None = None
@@ -306,11 +294,7 @@ class CpuRenderer:
         selection = None
         if not plane.is_panorama:
             camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
-            widening = math.ceil(_SHIFT_STEPS * math.hypot(*frame.settings.shift)) / _SHIFT_STEPS
-            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle + widening / (
-                math.sqrt(12) * frame.settings.near
-            )
-            selection = Selection(camera.compute_side_normals(), deviation)
+            selection = select_in_view(camera, frame.settings.largest_blur)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
@@ -338,32 +322,25 @@ class CpuRenderer:
         start = time.perf_counter()
         stored = self._find_face_set(frame)
         missing = stored.find_missing(frame)
-        drawn, stages = 0, {}
+        stages = {}
         if missing:
             self._stop()
-
-            def draw_missing() -> None:
-                nonlocal drawn
-                drawn = sum(self._draw_face(frame, stored, face) for face in missing)
-
-            self._start(draw_missing).result()
+            self._start(lambda: self._draw_faces(frame, stored, missing)).result()
             stages["faces"] = 1e3 * (time.perf_counter() - start)
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
         stored.faces.sample(frame.rotation, frame.focal, pixels, bottom_up=True)
         stages["sample"] = 1e3 * (time.perf_counter() - before)
         pixels = _enlarge(frame, pixels, stages)
-        stats = self._make_stats(frame, drawn, 1e3 * (time.perf_counter() - start), stages)
-        return _Picture(frame, pixels, None, None, replace(stats, cached=not missing))
+        return _Picture(frame, pixels, None, None, _make_stats(1e3 * (time.perf_counter() - start), stages))
 
-    def _draw_face(self, frame: Frame, stored: _FaceSet, face: int) -> int:
-        """Draw one face unless it is finished; returns the number of Gaussians."""
-        if face in stored.done:
-            return 0
-        layers = self._rasterize(frame, stored.groups, stored.faces.plane(face))
-        _write_pixels(frame.settings, stored.groups, layers.sums, stored.faces.pixels[face])
-        stored.done.add(face)
-        return layers.statistics.visible
+    def _draw_faces(self, frame: Frame, stored: _FaceSet, faces: Iterable[int]) -> None:
+        """Draw the faces that are not finished."""
+        for face in faces:
+            if face not in stored.done:
+                layers = self._rasterize(frame, stored.groups, stored.faces.plane(face))
+                _write_pixels(frame.settings, stored.groups, layers.sums, stored.faces.pixels[face])
+                stored.done.add(face)
 
     def _find_face_set(self, frame: Frame) -> _FaceSet:
         """The faces of a frame's position, settings and resolution; the least recently used set is dropped."""
@@ -376,16 +353,6 @@ class CpuRenderer:
         return self._faces[key]
 
     # --- results ---
-
-    def _make_stats(self, frame: Frame, drawn: int, frame_ms: float, stages: dict[str, float]) -> FrameStats:
-        return FrameStats(
-            total=self.stats.total,
-            drawn=drawn,
-            sort_ms=stages.get("sort", 0.0),
-            frame_ms=frame_ms,
-            stages=stages,
-            size=frame.size,
-        )
 
     def _show(self, picture: _Picture) -> moderngl.Texture | None:
         """Upload a picture and return its texture."""
@@ -446,6 +413,10 @@ def create_renderer(
 
     say_detail("drawing", f"by OpenGL, {ctx.info['GL_RENDERER']}")
     return SplatRenderer(ctx, color_bits=color_bits)
+
+
+def _make_stats(frame_ms: float, stages: dict[str, float]) -> FrameStats:
+    return FrameStats(sort_ms=stages.get("sort", 0.0), frame_ms=frame_ms, stages=stages)
 
 
 def _face_key(frame: Frame) -> Hashable:

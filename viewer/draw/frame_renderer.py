@@ -39,7 +39,7 @@ class FrameRenderer(Protocol):
 
     @property
     def stats(self) -> FrameStats:
-        """Counts and times of the last frame."""
+        """Times of the last frame."""
         ...
 
     @property

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.constants import MAX_FOV_DEGREES, MAX_PITCH_DEGREES, MIN_FOV_DEGREES
+from pansplat.constants import FILTER_VARIANCE, MAX_FOV_DEGREES, MAX_PITCH_DEGREES, MIN_FOV_DEGREES
 from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.path import turn_axes
 
@@ -145,6 +145,11 @@ class Pinhole:
     def half_size(self) -> tuple[float, float]:
         """Half the image size in image-plane units (z = 1)."""
         return 0.5 * self.width / self.focal, 0.5 * self.height / self.focal
+
+    @property
+    def filter_deviation(self) -> float:
+        """Standard deviation of the low-pass filter (docs/rendering.md, section 2), in image-plane units."""
+        return math.sqrt(FILTER_VARIANCE) / self.focal
 
     def compute_side_normals(self) -> Float[np.ndarray, "4 3"]:
         """Return the inward unit normals, in world axes, of the view frustum's four sides."""

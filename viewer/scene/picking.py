@@ -1,19 +1,16 @@
 """The point of a scene under the pointer, and its distance."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from pansplat.constants import ALPHA_CUT, MAX_ALPHA
-from pansplat.gaussians.scene import Scene
-from pansplat.geometry.pose import rotations_from_quats
+from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.settings import DrawSettings
 
-_MIN_RELATIVE_SCALE = 1e-6  # of the distance; thinner Gaussians are this thick
+_SIZE, _FOV_DEGREES = 3, 0.3  # side of the image around a ray, pixels, and its field of view
 
 
 @dataclass(frozen=True)
@@ -48,61 +45,19 @@ def project_point(
 
 
 def pick_point(
-    scene: Scene, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], settings: DrawSettings
-) -> PickedPoint | None:
-    """Return the point that a ray shows; None if no Gaussian reaches the alpha cut.
-
-    The response is that of the kernel `ray` without the low-pass filter. Levels, opacity threshold and the view of mode
-    `view` select Gaussians as they do in the image; other modes count the Gaussians of all views.
-    """
-    gaussians = scene.gaussians
-    offsets = gaussians.means.double().numpy() - origin
-    distances = np.linalg.norm(offsets, axis=1)
-    along = offsets @ direction
-    across = np.sqrt(np.maximum(distances**2 - along**2, 0))
-    reach = 3.4 * gaussians.scales.max(dim=1).values.numpy()  # alpha 1 falls to the cut within 3.33 deviations
-    near = (across <= reach) & (along > -reach) & (distances >= settings.near) & _select(scene, settings)
-    indices = np.flatnonzero(near)
-    if not len(indices):
-        return None
-    alphas = _evaluate_alphas(scene, indices, offsets[indices], distances[indices], direction)
-    seen = alphas >= ALPHA_CUT
-    indices, alphas = indices[seen], alphas[seen]
-    if not len(indices):
-        return None
-    order = np.argsort(distances[indices], kind="stable")
-    indices, alphas = indices[order], alphas[order]
-    weights = alphas * np.concatenate((np.ones(1), np.cumprod(1 - alphas)[:-1]))
-    depth = float((weights * distances[indices]).sum() / weights.sum())
-    x, y, z = (origin + depth * direction).tolist()
-    return PickedPoint((x, y, z), depth)
-
-
-def _select(scene: Scene, settings: DrawSettings) -> Bool[np.ndarray, "n"]:
-    gaussians = scene.gaussians
-    selected = np.ones(len(gaussians), bool)
-    if settings.levels is not None:
-        selected &= np.isin(gaussians.levels.numpy(), list(settings.levels))
-    if settings.mode == "view":
-        selected &= gaussians.views.numpy() == settings.view
-    return selected
-
-
-def _evaluate_alphas(
-    scene: Scene,
-    indices: np.ndarray,
-    offsets: Float[np.ndarray, "n 3"],
-    distances: Float[np.ndarray, "n"],
+    renderer: FrameRenderer,
+    origin: Float[np.ndarray, "3"],
     direction: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "n"]:
-    """Return the largest response of each Gaussian on the ray; 0 if it lies behind the origin."""
-    gaussians = scene.gaussians
-    chosen = torch.from_numpy(indices)
-    rotations = rotations_from_quats(gaussians.quats[chosen].double()).numpy()
-    scales = np.maximum(gaussians.scales[chosen].double().numpy(), _MIN_RELATIVE_SCALE * distances[:, None])
-    mean = np.einsum("nji,nj->ni", rotations, offsets) / scales  # in the axes in which the Gaussian is a unit ball
-    ray = np.einsum("nji,j->ni", rotations, direction) / scales
-    squared = (np.cross(mean, ray) ** 2).sum(axis=1) / (ray**2).sum(axis=1)
-    ahead = (mean * ray).sum(axis=1) > 0
-    alphas = gaussians.opacities[chosen].double().numpy() * np.exp(-0.5 * squared)
-    return np.where(ahead, np.minimum(alphas, MAX_ALPHA), 0)
+    settings: DrawSettings,
+) -> PickedPoint | None:
+    """Return the point that a renderer draws on a ray, by a small image around it; None if it draws nothing there."""
+    pose = np.eye(4)
+    pose[:3, 0] = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)  # an axis that is not along the ray
+    pose[:3, 0] /= np.linalg.norm(pose[:3, 0])
+    pose[:3, 1], pose[:3, 2], pose[:3, 3] = np.cross(direction, pose[:3, 0]), direction, origin
+    settings = replace(settings, layout="pinhole", scale=1.0, vertical_fov_degrees=_FOV_DEGREES)
+    _, depths = render_image(renderer, pose, (_SIZE, _SIZE), settings, with_depth=True)
+    assert depths is not None
+    depth = float(depths[_SIZE // 2, _SIZE // 2])
+    x, y, z = (origin + depth * direction).tolist()
+    return PickedPoint((x, y, z), depth) if depth > 0 else None

@@ -15,11 +15,8 @@ Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Display = Literal["color", "depth", "opacity", "levels", "views"]
 
-_CHOICES = {
-    "mode": Mode,
-    "layout": Layout,
-    "display": Display,
-}
+_CHOICES = {"mode": Mode, "layout": Layout, "display": Display}
+_BLUR_STEPS = 20  # a metre, to which the movement of an exposure is rounded up, so that selections serve several frames
 SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis"}
 """Displays of one number a pixel, and their colour maps."""
 
@@ -78,6 +75,11 @@ class DrawSettings:
         return self.levels is None and self.display == "color" and self.mode != "view"
 
     @property
+    def largest_blur(self) -> float:
+        """Standard deviation, radians, by which the movement blurs the nearest Gaussians at most."""
+        return math.ceil(_BLUR_STEPS * math.hypot(*self.shift)) / _BLUR_STEPS / (math.sqrt(12) * self.near)
+
+    @property
     def splat_colors(self) -> Literal["color", "levels", "views"]:
         """The colours of the Gaussians."""
         return self.display if self.display in ("levels", "views") else "color"
@@ -85,11 +87,9 @@ class DrawSettings:
 
 @dataclass(frozen=True)
 class FrameStats:
-    """Counts and times of the last frame.
+    """Times of the last frame.
 
     Attributes:
-        drawn: splats sent to the GPU for this frame after culling, summed over faces and views; 0 if all layers
-            were cached.
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
         settled: False if the frame used the order and colours of an earlier position because the new ones are not
             ready, or the last image because the new one is not ready; render again to get it.
@@ -99,12 +99,8 @@ class FrameStats:
         stages: milliseconds of each stage, where the renderer measures them.
     """
 
-    total: int = 0  # Gaussians of the scene on the GPU
-    drawn: int = 0
     sort_ms: float = 0.0
     frame_ms: float = 0.0
     timed: DrawSettings | None = None
-    cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)
-    size: tuple[int, int] = (0, 0)  # (width, height) at which the image was drawn, pixels

@@ -70,10 +70,10 @@ class Panels:
     def draw(self, viewer: Viewer) -> None:
         """Draw the panels that are shown."""
         self.widgets.items.clear()
-        state, stats, placing = viewer.state, viewer.stage.renderer.stats, viewer.placing
+        state, placing = viewer.state, viewer.placing
         if state.overlay:
             self._draw_main_panel(viewer)
-        if stats.total:
+        if viewer.stage.slot.scene is not None:
             draw_legend(state)
         if state.overlay and state.points:
             draw_points(state)
@@ -180,7 +180,7 @@ class Panels:
         """Draw how the camera moves, and what is drawn of the Gaussians."""
         imgui.separator_text("Camera")
         self._draw_camera(viewer)
-        if viewer.stage.renderer.stats.total:
+        if viewer.stage.slot.scene is not None:
             imgui.separator_text("Gaussians")
             self._draw_gaussians(viewer.state)
         imgui.separator_text("Display")
