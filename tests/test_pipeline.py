@@ -18,11 +18,11 @@ from pansplat.cli import run
 from pansplat.errors import InputWarning
 from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
 from pansplat.networks.weights import pack_weights, save_weights
-from pansplat.pipeline import load, load_pairs, predict, predict_to_file, predict_tour, render, save
+from pansplat.pipeline import load, load_sets, predict, predict_to_file, predict_tour, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
 from pansplat.tours.graph import TourGraph, find_tours, select_views
@@ -42,7 +42,7 @@ def test_a_predicted_scene_holds_its_cameras_and_predictor_name(scene: Scene) ->
 
 
 def test_a_scene_of_one_panorama_keeps_its_title_and_start_view(pair_folder: Path, sphere_predictor) -> None:
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     single = replace(pair, context=(replace(pair.context[1], title="hall", start=(7.0, 0.1)),))
     for cache in (True, True, False):
         scene = predict(single, sphere_predictor(), height=HEIGHT, cache=cache)
@@ -55,7 +55,7 @@ def test_a_scene_of_one_panorama_keeps_its_title_and_start_view(pair_folder: Pat
 def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predictors_limit(
     pair_folder: Path, sphere_predictor, photographs: int, largest: int | None, expected: int
 ) -> None:
-    predictor, pair = sphere_predictor(), pipeline.load_pairs(pair_folder)[0]
+    predictor, pair = sphere_predictor(), pipeline.load_sets(pair_folder)[0]
     if largest is not None:
         predictor.default_height = largest
     for panorama, height in zip(pair.context, (photographs, 2 * photographs), strict=True):
@@ -68,12 +68,12 @@ def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predic
 def test_a_single_view_has_the_scale_of_its_camera_height(tmp_path: Path, sphere_predictor, write_pair) -> None:
     photograph = write_pair(tmp_path / "pair") / "left.png"
     usual, tall = (
-        predict(load_pairs(photograph, camera_height=height)[0], sphere_predictor(), height=64) for height in (1.5, 3.0)
+        predict(load_sets(photograph, camera_height=height)[0], sphere_predictor(), height=64) for height in (1.5, 3.0)
     )
     assert torch.equal(tall.gaussians.means, 2 * usual.gaussians.means)  # its camera is at the origin
     assert torch.equal(tall.gaussians.scales, 2 * usual.gaussians.scales)
     assert torch.equal(tall.cam2world, usual.cam2world)
-    expect_error("camera_height", load_pairs, photograph, camera_height=0.0)
+    expect_error("camera_height", load_sets, photograph, camera_height=0.0)
 
 
 def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_camera_height(
@@ -81,14 +81,14 @@ def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_ca
 ) -> None:
     folder = write_pair(tmp_path / "pair")
     (folder / "poses.json").unlink()
-    shown: list[Pair] = []
+    shown: list[PanoramaSet] = []
 
-    def stop(pairs: list[Pair]) -> None:
+    def stop(pairs: list[PanoramaSet]) -> None:
         shown.extend(pairs)
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        load_pairs(folder, camera_height=3.0, on_unposed=stop)
+        load_sets(folder, camera_height=3.0, on_unposed=stop)
     assert [view.camera_height for pair in shown for view in pair.context] == [3.0, 3.0]
 
 
@@ -152,7 +152,7 @@ def test_a_folder_of_several_pairs_names_the_call_for_all_of_it_which_takes_its_
 def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_their_holes(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor
 ) -> None:
-    (tour,) = find_tours(load_pairs(write_tour(tmp_path / "house", 4)))
+    (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
     pose = torch.eye(4, dtype=torch.float64)
     pose[2, 3] = 0.4 * 0.5  # between the first two of four panoramas in a row, 0.5 m apart
@@ -173,7 +173,7 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
 def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor, blending: str
 ) -> None:
-    pairs = load_pairs(write_tour(tmp_path / "house", 3))
+    pairs = load_sets(write_tour(tmp_path / "house", 3))
     alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
@@ -294,7 +294,7 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
 def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(
     tmp_path: Path, write_pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (pair,) = load_pairs(write_pair(tmp_path / "pair", height=64))
+    (pair,) = load_sets(write_pair(tmp_path / "pair", height=64))
     for height, rows in ((16, 32), (48, 64), (64, 64)):
         assert pipeline.load_photographs(pair, height).images.shape[-2] == rows
     monkeypatch.setattr(pipeline.prediction, "DISPLAY_HEIGHT", 24)
@@ -338,7 +338,7 @@ def test_predictions_are_written_in_the_format_of_the_suffix(
 def test_the_scene_of_a_tour_holds_each_panorama_once(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor: type
 ) -> None:
-    (tour,) = find_tours(load_pairs(write_tour(tmp_path / "house", 4)))
+    (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     predictor = sphere_predictor()
     scene = predict_tour(tour, predictor, cache=False)
     assert predictor.calls == len(tour.choose_sources()) == 3
@@ -368,7 +368,7 @@ class PairsOnly:
 @pytest.fixture
 def parted_tour(tmp_path: Path, write_tour: Callable[..., Path]) -> TourGraph:
     """Two panoramas that are a pair, and one of another part."""
-    pairs = load_pairs(write_tour(tmp_path / "house", 3))
+    pairs = load_sets(write_tour(tmp_path / "house", 3))
     alone = replace(pairs[1], name="p2", context=(replace(pairs[1].context[1], world=1),))
     (tour,) = find_tours([pairs[0], alone])
     return tour
@@ -387,7 +387,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
 
 
 def test_a_photograph_alone_is_refused_by_a_model_that_needs_two(pair_folder: Path, weights: Path) -> None:
-    (single,) = load_pairs(pair_folder / "left.png")
+    (single,) = load_sets(pair_folder / "left.png")
     message = r"left\.png: pansplat needed 2 or more panoramas of one room, got 1; choose the model default"
     for run_prediction in (predict, lambda pair, model: predict_to_file(pair, pair_folder / "x.ply", model)):
         expect_error(message, run_prediction, single, weights)
@@ -428,7 +428,7 @@ def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
     unit, origin = FRAMES[name]
     # An origin of the working world is a multiple of 64 m; that of the poses is not.
     moved = torch.tensor([0.0, 32.0, 16.0] if origin else [0.0] * 3, dtype=torch.float64)
-    (in_metres,), (pair,) = load_pairs(room("metres")), load_pairs(room(name))
+    (in_metres,), (pair,) = load_sets(room("metres")), load_sets(room(name))
     views = in_metres.load_context(64)
     cam2world = views.cam2world.clone()
     cam2world[:, :3, 3] += moved
@@ -474,7 +474,7 @@ def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
 def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(
     room: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    (pair,) = load_pairs(room("UTM"))
+    (pair,) = load_sets(room("UTM"))
     views = pair.load_context(64)
     scene = predict(views, "sweep")
     x, y, z = scene.frame.origin
@@ -486,7 +486,7 @@ def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin
 
 
 def test_views_of_arrays_and_of_bytes_are_those_of_tensors(pair_folder: Path, sphere_predictor) -> None:
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     views = pair.load_context(HEIGHT)
     expected = predict(views, sphere_predictor()).gaussians.harmonics
     arrays = replace(

@@ -12,7 +12,7 @@ import torch
 from refusals import expect_error
 
 from pansplat.gaussians import formats
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat.networks.weights import load_weights, pack_weights, save_weights
 from pansplat.system import console
 from pansplat.system.files import make_portable_name, require_output_folder
@@ -49,7 +49,7 @@ def test_a_picture_that_poses_name_in_other_capitals_is_one_picture(pair_folder:
     content["poses"]["LEFT.PNG"] = content["poses"].pop("left.png")
     (pair_folder / "poses.json").write_text(json.dumps(content))
     os.link(pair_folder / "left.png", pair_folder / "LEFT.PNG")  # as if the file system ignored capitals
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     assert sorted(view.image.name for view in pair.context) == ["LEFT.PNG", "right.png"]
 
 

@@ -19,7 +19,7 @@ SPREAD_DB, SPREAD_LPIPS = 0.0016, 0.00012
 
 @pytest.mark.parametrize(("views", "psnr", "lpips"), [(2, 25.631, 0.1096), (1, 21.363, 0.1196)])
 def test_pictures_of_the_sample_are_as_good_as_they_were(shared: Path, views: int, psnr: float, lpips: float) -> None:
-    (pair,) = pansplat.load_pairs(Path(__file__).resolve().parents[1] / "assets" / "living_room")
+    (pair,) = pansplat.load_sets(Path(__file__).resolve().parents[1] / "assets" / "living_room")
     given, target = pair.load_context(256), pair.load_targets(256)
     fields = {name: getattr(given, name)[:views] for name in ("images", "cam2world", "masks", "names")}
     scene = pansplat.predict(replace(given, **fields))

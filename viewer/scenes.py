@@ -16,7 +16,7 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import plan_route
 from pansplat_viewer.scene import camera as cameras

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from pansplat.export.film import Film, Shot
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
     from pansplat.rendering import Rendering
     from pansplat.tours.camera_path import CameraPath
     from pansplat.tours.route import Route
@@ -173,7 +173,7 @@ class Render(Computation):
         flight = _plan_route(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
         return list_flight(flight, self.fps, self.fov, self.seconds)
 
-    def _make_film(self, scene: Scene, source: Pair | None, options: dict[str, Any], count: int) -> Film:
+    def _make_film(self, scene: Scene, source: PanoramaSet | None, options: dict[str, Any], count: int) -> Film:
         """Draws the scene, and photographs that no option replaces; `count` is the number of frames."""
         import functools
 

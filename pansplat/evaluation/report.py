@@ -26,7 +26,7 @@ from pansplat.evaluation.metrics import cross_fade, distortion, psnr, ssim, ws_p
 from pansplat.evaluation.results import Column, Row, average_rows, make_folder, rich_table, write_json
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor
@@ -43,7 +43,7 @@ ERROR_SCALE = 0.25  # mean absolute colour error that the brightest colour of an
 
 
 def evaluate(
-    pairs: Sequence[Pair],
+    pairs: Sequence[PanoramaSet],
     predictor: Predictor,
     out: Path,
     *,
@@ -93,7 +93,7 @@ def warm_up(predictor: Predictor) -> None:
 
 
 def _evaluate_pair(
-    pair: Pair,
+    pair: PanoramaSet,
     predictor: Predictor,
     out: Path,
     taken: set[str],

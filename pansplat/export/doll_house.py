@@ -31,7 +31,7 @@ from pansplat import pipeline
 from pansplat.export.photographs import read_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, are_seen, measure_reach
 from pansplat.tours.doll_house import Rooms
 
@@ -194,7 +194,7 @@ def _raise_walls(
 
 
 @torch.no_grad()
-def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[Pair] = ()) -> DollHouse:
+def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet] = ()) -> DollHouse:
     """The doll's houses of a scene.
 
     Args:
@@ -308,7 +308,7 @@ def _pack(panels: Sequence[Panel], density: float) -> tuple[float, Int[np.ndarra
 class _Painter:
     """Projects photographs on panels."""
 
-    def __init__(self, scene: Scene, rooms: Rooms, photographs: Sequence[Pair]) -> None:
+    def __init__(self, scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet]) -> None:
         self.rooms, self.poses, self.level = rooms, scene.cam2world.double().cpu(), torch.from_numpy(rooms.level)
 
         @functools.lru_cache(maxsize=_KEPT)

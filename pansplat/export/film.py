@@ -22,7 +22,7 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import level_axes
 from pansplat.images.panorama_metadata import Stereo
 from pansplat.images.video import write_video
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
@@ -46,7 +46,7 @@ class FilmPhotographs:
 
     def __init__(
         self,
-        photographs: Sequence[Pair],
+        photographs: Sequence[PanoramaSet],
         cam2world: Float[Tensor, "photograph 4 4"],
         gains: Sequence[tuple[float, ...]] = (),
     ) -> None:
@@ -71,9 +71,9 @@ class FilmPhotographs:
         self._load = load
 
     @staticmethod
-    def open(source: Pair | TourGraph, scene: Scene) -> FilmPhotographs:
+    def open(source: PanoramaSet | TourGraph, scene: Scene) -> FilmPhotographs:
         """The photographs that a scene, or all scenes of a tour, are predicted from."""
-        panoramas = source.context if isinstance(source, Pair) else source.panoramas
+        panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
         poses = torch.stack([panorama.cam2world for panorama in panoramas])
         gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
         return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)

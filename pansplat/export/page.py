@@ -46,7 +46,7 @@ from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_file
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, turn_axes
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Views
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
 from pansplat.rendering.color_fit import fit_colors
@@ -122,7 +122,7 @@ def write_page(
     split: bool = False,
     title: str | None = None,
     address: str | None = None,
-    photographs: Sequence[Pair] = (),
+    photographs: Sequence[PanoramaSet] = (),
     photo_height: int | None = None,
 ) -> PageFiles:
     """Write a scene as a web page.
@@ -373,7 +373,7 @@ def _choose_degree(scene: Scene, num_bytes: float) -> int:
     return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= num_bytes), 0)
 
 
-def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[Pair]) -> bytes:
+def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[PanoramaSet]) -> bytes:
     """A JPEG of the first view of the page; at a panorama it shows the photograph, if there is one."""
     fov = math.degrees(2 * math.atan(PageConstants().tallest * math.tan(math.radians(_START_FOV / 2))))
 

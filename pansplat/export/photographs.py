@@ -31,7 +31,7 @@ from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import read_face_size
 from pansplat.images.masks import mask_holes
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, make_unique_name
 from pansplat.system.progress import report_progress
 from pansplat.tours.graph import TourGraph, make_graph, select_views
@@ -108,15 +108,15 @@ def label_files(names: Sequence[str]) -> list[str]:
     return labels
 
 
-def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pair]:
+def list_photographs(source: PanoramaSet | TourGraph, views: Sequence[int]) -> list[PanoramaSet]:
     """A pair of one panorama for each of some views of a scene that was predicted from a pair or tour."""
     if isinstance(source, TourGraph):
-        return [source.make_pair([view]) for view in views]
+        return [source.make_set([view]) for view in views]
     return [dataclasses.replace(source, context=(source.context[view],)) for view in views]
 
 
 def pack_photographs(
-    scene: Scene, photographs: Sequence[Pair], num_bytes: float, height: int | None
+    scene: Scene, photographs: Sequence[PanoramaSet], num_bytes: float, height: int | None
 ) -> list[PackedPhotograph]:
     """The photographs of a scene's views, within a number of bytes if that is possible.
 
@@ -153,7 +153,7 @@ def pack_photographs(
 
 
 @torch.no_grad()
-def read_photograph(scene: Scene, view: int, photograph: Pair, height: int) -> Float[Tensor, "3 height width"]:
+def read_photograph(scene: Scene, view: int, photograph: PanoramaSet, height: int) -> Float[Tensor, "3 height width"]:
     """A photograph of at most a height, with the exposure of the Gaussians, and without what its masks hide."""
     image, shown = load_photograph(photograph, height)
     if scene.joint and scene.gains:  # the Gaussians of single views have the exposure of their photographs
@@ -167,7 +167,7 @@ def read_photograph(scene: Scene, view: int, photograph: Pair, height: int) -> F
 
 
 def load_photograph(
-    photograph: Pair, height: int
+    photograph: PanoramaSet, height: int
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
     """The picture of a pair of one panorama, of at most a height, and where it may be shown: 0 in what masks hide."""
     views = photograph.load_context(max(min(height, photograph.image_height), 2))  # faces need two rows

@@ -20,7 +20,7 @@ from msgspec import Meta, Struct
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.inputs.pairs import (
+from pansplat.inputs.panorama_sets import (
     FAR,
     FAR_SEQUENCE,
     MAX_CONTEXT,

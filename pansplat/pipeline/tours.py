@@ -13,9 +13,9 @@ import torch
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.pipeline.models import find_min_views, load_model
-from pansplat.pipeline.prediction import choose_options, choose_refine_steps, fuse, load_pairs, predict, refine_scene
+from pansplat.pipeline.prediction import choose_options, choose_refine_steps, fuse, load_sets, predict, refine_scene
 from pansplat.prediction_options import PredictOptions, choose_caches
 from pansplat.predictor import Predictor
 from pansplat.refinement import fuse_views
@@ -65,7 +65,7 @@ def predict_tour(
     each = replace(options, joint=False, refine_steps=0) if options.joint else options
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
-        number, pair = next(counter), tour.make_pair(views)
+        number, pair = next(counter), tour.make_set(views)
         fitted = fit_to_scene(each, pair, part)
         with stage(number / total, f"scene {number} of {total}: "):
             return predict(pair, choose_predictor(pair, predictor), options=fitted)
@@ -85,7 +85,7 @@ def _fuse_tour(tour: TourGraph, scene: Scene, refine_steps: int | None) -> Scene
     for number, nodes in enumerate(parts, 1):
         part = select_views(scene, nodes)
         if len(nodes) > 1:
-            pair = tour.make_pair(nodes)
+            pair = tour.make_set(nodes)
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             steps = choose_refine_steps(len(nodes), joint=True) if refine_steps is None else refine_steps
             if steps:
@@ -99,7 +99,7 @@ def _fuse_tour(tour: TourGraph, scene: Scene, refine_steps: int | None) -> Scene
     return replace(scene, gaussians=Gaussians.cat(fused), gains=tuple(gains), joint=True)
 
 
-def choose_predictor(pair: Pair, predictor: Predictor) -> Predictor:
+def choose_predictor(pair: PanoramaSet, predictor: Predictor) -> Predictor:
     """The predictor of a scene of a tour: `default` for a single view if the given one needs two or more views."""
     return predictor if len(pair.context) >= find_min_views(predictor) else load_model()
 
@@ -121,14 +121,14 @@ def find_max_views(predictor: Predictor) -> int:
     return getattr(predictor, "max_views", MAX_SCENE_VIEWS)
 
 
-def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.inf) -> PredictOptions:
+def fit_to_scene(options: PredictOptions, pair: PanoramaSet, gaussians: float = math.inf) -> PredictOptions:
     """The options of a scene of a tour, from those of the tour.
 
     The height, by default that of the photographs, at most 512, is halved while the prediction has more than four times
     as many Gaussians as are kept: a refinement after a few mergers fits the photographs better than after many.
 
     Args:
-        pair: of `TourGraph.make_pair`.
+        pair: of `TourGraph.make_set`.
         gaussians: number that is kept of each panorama.
     """
     height = options.height
@@ -142,10 +142,10 @@ def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.in
 
 def _load_only_tour(path: str | Path) -> TourGraph:
     with stage(POSED):
-        tours = find_tours(load_pairs(path))
+        tours = find_tours(load_sets(path))
     if len(tours) != 1:
         names = f" ({', '.join(tour.name for tour in tours[:8])}{', ...' if len(tours) > 8 else ''})" if tours else ""
-        advice = "give its folder" if tours else "predict one pair: predict(load_pairs(path)[0])"
+        advice = "give its folder" if tours else "predict one pair: predict(load_sets(path)[0])"
         raise InputError(f"{path}: needed the panoramas of one tour, got {len(tours)} tours{names}; {advice}")
     with stage(CONNECTED):
         return connect(tours[0])

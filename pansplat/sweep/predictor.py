@@ -14,7 +14,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
 from pansplat.images.masks import mask_holes
-from pansplat.inputs.pairs import MAX_CONTEXT
+from pansplat.inputs.panorama_sets import MAX_CONTEXT
 from pansplat.predictor import require_matching_inputs, select_item
 from pansplat.rendering.color_fit import fit_colors
 from pansplat.sweep.lift import lift

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pansplat.gaussians.scene import Gains, Gaussians, Overlaps, Scene, Starts
 from pansplat.geometry.path import find_direction, level_pose, up_direction, wrap_angle
-from pansplat.inputs.pairs import FAR, NEAR, Link, Pair, Panorama
+from pansplat.inputs.panorama_sets import FAR, NEAR, Link, Panorama, PanoramaSet
 from pansplat.inputs.placements import PLACED, ApproximatePlace, Placement
 from pansplat.system.components import label_components
 from pansplat.system.descriptions import describe_count, describe_range, list_first
@@ -303,7 +303,7 @@ class TourGraph:
         a, b = self.positions[list(edge)]
         return float(np.linalg.norm(a - b))
 
-    def make_pair(self, views: Sequence[int]) -> Pair:
+    def make_set(self, views: Sequence[int]) -> PanoramaSet:
         """The panoramas of a scene as the input of a prediction, in their own world.
 
         It does not depend on other worlds, so that cached predictions stay valid when panoramas are added.
@@ -313,9 +313,9 @@ class TourGraph:
         near, far = self.near, self.far
         if len(context) == 1:  # its walls may be nearer than what the cameras of the pairs see
             near, far = min(near, NEAR), max(far, FAR)
-        return Pair(name, self.folder, context, (), near, far, self.siblings)
+        return PanoramaSet(name, self.folder, context, (), near, far, self.siblings)
 
-    def leave_out(self, node: int) -> Pair:
+    def leave_out(self, node: int) -> PanoramaSet:
         """A pair whose target is a panorama, and whose context is what the tour without it would show at its position.
 
         That is the scene of the nearest edge of its world.
@@ -326,12 +326,12 @@ class TourGraph:
         others = dataclasses.replace(self, overlaps=overlaps)
         near = [edge for edge in overlaps if self.worlds[edge[0]] == self.worlds[node]]
         edge = min(near, key=lambda edge: others.measure_distance(edge, self.positions[node]))
-        pair = self.make_pair(others.choose_scene_views()[edge])
+        pair = self.make_set(others.choose_scene_views()[edge])
         target = (self.originals or self.panoramas)[node]
         return dataclasses.replace(pair, name=target.name, targets=(target,))
 
     def place(self, scene: Scene, views: ViewNumbers) -> Scene:
-        """The scene of `make_pair` in the world of the tour."""
+        """The scene of `make_set` in the world of the tour."""
         if not self.originals or self.panoramas[views[0]] is self.originals[views[0]]:
             return scene
         first = self.panoramas[views[0]]
@@ -549,17 +549,17 @@ def _improve_order(order: Int[np.ndarray, "node"], costs: Float[np.ndarray, "nod
     return order
 
 
-def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
+def find_tours(pairs: Sequence[PanoramaSet]) -> list[TourGraph]:
     """Tours of the pairs of folders; their edges are the pairs, with overlaps that are not measured (1).
 
     Three or more panoramas that pairs connect are a tour. But if a panorama of a folder is in no pair with another one,
     or the folder has several worlds, all its panoramas are one tour; a panorama without another one has a self-edge.
     """
-    of_folder: dict[Path, list[Pair]] = {}
+    of_folder: dict[Path, list[PanoramaSet]] = {}
     for pair in pairs:
         of_folder.setdefault(pair.folder, []).append(pair)
     joint = {folder for folder, group in of_folder.items() if _is_one_tour(group)}
-    components: list[list[Pair]] = []
+    components: list[list[PanoramaSet]] = []
     for pair in pairs:
         if pair.folder in joint:
             continue
@@ -575,14 +575,14 @@ def find_tours(pairs: Sequence[Pair]) -> list[TourGraph]:
     return tours
 
 
-def _is_one_tour(pairs: Sequence[Pair]) -> bool:
+def _is_one_tour(pairs: Sequence[PanoramaSet]) -> bool:
     """Whether the panoramas of a folder are one tour of several parts."""
     images = set().union(*map(_list_images, pairs))
     is_alone = any(len(pair.context) == 1 for pair in pairs)
     return len({view.world for pair in pairs for view in pair.context}) > 1 or (is_alone and len(images) > 1)
 
 
-def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
+def _make_tour(pairs: Sequence[PanoramaSet]) -> TourGraph:
     """The tour of all panoramas of some pairs."""
     first = pairs[0]
     found = {panorama.image: panorama for pair in pairs for panorama in pair.context}
@@ -604,7 +604,7 @@ def _make_tour(pairs: Sequence[Pair]) -> TourGraph:
     return TourGraph(name, first.folder, lay_out(originals), near, far, first.siblings, overlaps, originals)
 
 
-def _list_images(pair: Pair) -> set[Path]:
+def _list_images(pair: PanoramaSet) -> set[Path]:
     return {panorama.image for panorama in pair.context}
 
 
@@ -613,7 +613,7 @@ def merge_scenes(tour: TourGraph, load: Callable[[ViewNumbers], Scene], max_view
 
     Args:
         tour: the graph.
-        load: returns the scene of some panoramas (`make_pair`); called once for each scene that is needed.
+        load: returns the scene of some panoramas (`make_set`); called once for each scene that is needed.
         max_views: of the predictor (`TourGraph.choose_sources`).
     """
     parts: dict[int, Gaussians] = {}

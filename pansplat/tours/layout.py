@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pansplat.geometry.path import level_pose, up_direction
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 
 REACH = 2.0  # metres, in which a camera moves around the panoramas of its part
 _GAP = 8.0  # metres, between what the cameras of two worlds reach, so that few rooms meet in the floor plan

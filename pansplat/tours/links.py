@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.panorama_sets import Link
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.outlook import find_bin
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import CAMERA_POSES, read_loc360_sequence
 from pansplat.inputs.folders import require_known_masks
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.inputs.views import Sample, Views, select_views
 from pansplat.system.files import expand_home
 
@@ -88,7 +88,7 @@ class ImageSequence:
     def read(self, frames: Sequence[int], height: int) -> Views:
         """The given frames at (height, 2 height), in the order of `frames`."""
         chosen = tuple(self.panoramas[frame] for frame in frames)
-        return Pair(self.name, chosen[0].image.parent, (), chosen, self.near, self.far).load_targets(height)
+        return PanoramaSet(self.name, chosen[0].image.parent, (), chosen, self.near, self.far).load_targets(height)
 
 
 def read_frame_pair(sequence: ImageSequence, pair: FramePair, height: int) -> Sample:

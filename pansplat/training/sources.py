@@ -16,8 +16,8 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import find_panogrf, find_triplets, read_panogrf_scene, read_triplet
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
 from pansplat.training.config import DataConfig
@@ -49,7 +49,7 @@ class SampleSource(Protocol):
 class PairSource:
     """Pairs with targets; each is a sample. Files are read by `sample`."""
 
-    pairs: Sequence[Pair]
+    pairs: Sequence[PanoramaSet]
 
     def __post_init__(self) -> None:
         if not self.pairs:
@@ -79,13 +79,13 @@ class TripletSource:
         source = self.sources[index]
         is_triplet = source.is_file()
         collection = read_triplet(source, source.parent) if is_triplet else read_panogrf_scene(source, source)
-        (pair,) = collection.pairs()
+        (pair,) = collection.sets()
         if not pair.targets:
             raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
         return _read_pair(dataclasses.replace(pair, siblings=()), height, seed)  # without detection of static content
 
 
-def _read_pair(pair: Pair, height: int, seed: int) -> Sample:
+def _read_pair(pair: PanoramaSet, height: int, seed: int) -> Sample:
     """The sample of a pair with one of its targets."""
     target = pair.targets[np.random.default_rng(seed).integers(len(pair.targets))]
     return Sample(
@@ -181,4 +181,4 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
 
 
 def _read_pairs(folder: Path) -> PairSource:
-    return PairSource([pair for pair in load_pairs(folder) if pair.targets])
+    return PairSource([pair for pair in load_sets(folder) if pair.targets])

@@ -27,7 +27,7 @@ from pansplat.export.doll_house import (
 )
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.doll_house import Rooms
 from pansplat.tours.graph import DrawnPlace, make_graph
 from pansplat.tours.plan import Door, Plan
@@ -67,10 +67,10 @@ def _color(places: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def photograph(tmp_path: Path) -> Callable[..., list[Pair]]:
+def photograph(tmp_path: Path) -> Callable[..., list[PanoramaSet]]:
     """A function that writes the photographs; by default of the colours of places, else of one for each camera."""
 
-    def write(*colors: tuple[int, int, int]) -> list[Pair]:
+    def write(*colors: tuple[int, int, int]) -> list[PanoramaSet]:
         pairs = []
         for view, place in enumerate(CAMERAS):
             rays = pixel_directions(256, 512, dtype=torch.float64).numpy()
@@ -83,7 +83,7 @@ def photograph(tmp_path: Path) -> Callable[..., list[Pair]]:
             path = tmp_path / f"{view}.png"
             Image.fromarray(image.round().astype(np.uint8)).save(path)
             panorama = Panorama(f"{view}", path, place_cameras(place)[0])
-            pairs.append(Pair(f"{view}", tmp_path, (panorama,), (), 0.3, 12.0, (path,)))
+            pairs.append(PanoramaSet(f"{view}", tmp_path, (panorama,), (), 0.3, 12.0, (path,)))
         return pairs
 
     return write
@@ -102,7 +102,7 @@ def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(
-    scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
+    scene: Scene, rooms: Rooms, photograph: Callable[..., list[PanoramaSet]]
 ) -> None:
     house = make_house(scene, rooms, photograph())
     places, colors = _sample(house)
@@ -155,7 +155,7 @@ def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(rooms: Room
 
 
 def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
-    scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
+    scene: Scene, rooms: Rooms, photograph: Callable[..., list[PanoramaSet]]
 ) -> None:
     pairs = photograph((200, 0, 0), (0, 0, 200), (0, 200, 0))
     hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)

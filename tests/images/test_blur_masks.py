@@ -21,8 +21,8 @@ from pansplat.images.blur_masks import blur_hidden, find_blur_mask, resize_hidde
 from pansplat.images.image_files import read_blur_mask, read_panorama, read_thumbnail, write_image
 from pansplat.images.rig_images import Lens
 from pansplat.inputs.content import hash_context, hash_panorama
-from pansplat.inputs.folders import load_pairs, load_panoramas
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.folders import load_panoramas, load_sets
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 from pansplat.poses.files import _hash_inputs
@@ -143,11 +143,11 @@ def test_black_masks_change_nothing_and_a_mask_of_most_is_noted(tmp_path: Path) 
 def test_cube_faces_of_a_panorama_are_blurred(tmp_path: Path, color_face: Callable[[str, int], np.ndarray]) -> None:
     for face in "frblud":
         Image.fromarray(color_face(face, 32)).save(tmp_path / f"hall_{face}.png")
-    (pair,) = load_pairs(tmp_path)
+    (pair,) = load_sets(tmp_path)
     plain = pair.load_context(HEIGHT)
     assert pair.context[0].name == "hall" and find_blur_mask(pair.context[0].image) is None
     Image.fromarray(np.where(HIDDEN, 255, 0).astype(np.uint8)).save(tmp_path / "hall_blur.png")
-    (pair,) = load_pairs(tmp_path)
+    (pair,) = load_sets(tmp_path)
     assert find_blur_mask(pair.context[0].image) == tmp_path / "hall_blur.png"
     views = pair.load_context(HEIGHT)
     hidden = torch.from_numpy(WIDE)
@@ -159,13 +159,13 @@ def test_damaged_and_white_masks_are_refused(tmp_path: Path) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     mask = folder / "left_blur.png"
     Image.new("L", (128, 64), 255).save(mask)
-    expect_error(r"left_blur\.png: .*white only", lambda: load_pairs(folder)[0].load_context(HEIGHT))
+    expect_error(r"left_blur\.png: .*white only", lambda: load_sets(folder)[0].load_context(HEIGHT))
     Image.new("L", (64, 64)).save(mask)
     for path in (folder, folder / "left.png"):
-        expect_error(r"left_blur\.png: .*128x64, got 64x64", load_pairs, path)
+        expect_error(r"left_blur\.png: .*128x64, got 64x64", load_sets, path)
     _draw_mask(mask)
     mask.write_bytes(mask.read_bytes()[:60])
-    for read in (lambda: load_pairs(folder), lambda: read_panorama(folder / "left.png", HEIGHT)):
+    for read in (lambda: load_sets(folder), lambda: read_panorama(folder / "left.png", HEIGHT)):
         expect_error(r"left_blur\.png: .*damaged", read)
 
 
@@ -186,9 +186,9 @@ def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool)
     if not is_posed:
         (folder / "poses.json").unlink()
     mask = _draw_mask(folder / name, kind="blur" if "blur" in name.lower() else "mask")
-    panoramas = load_pairs(folder)[0].context if is_posed else load_panoramas(folder)
+    panoramas = load_sets(folder)[0].context if is_posed else load_panoramas(folder)
     assert [view.name for view in panoramas] == ["left", "right"]
-    for view in (panoramas[0], load_pairs(folder / "left.png")[0].context[0]):
+    for view in (panoramas[0], load_sets(folder / "left.png")[0].context[0]):
         assert mask in (view.mask, find_blur_mask(view.image))
 
 
@@ -196,7 +196,7 @@ def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool)
 def test_the_mask_of_a_folder_is_one_in_any_case(tmp_path: Path, name: str) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     _draw_mask(folder / name, kind="mask")
-    assert torch.equal(load_pairs(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN))
+    assert torch.equal(load_sets(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN))
 
 
 @pytest.mark.parametrize(
@@ -219,12 +219,12 @@ def test_a_mask_that_is_not_applied_is_refused(tmp_path: Path, name: str, right:
     for path in (folder, *([folder / "left.png"] if name == "left_blur.jpg" else [])):
         with warnings.catch_warnings(), pytest.raises(InputError, match=rf"{name}: needed the name.*{right}"):
             warnings.filterwarnings("ignore", message=r".*has no pose of left_blur\.jpg")
-            load_pairs(path)
+            load_sets(path)
 
 
 def test_two_masks_of_a_panorama_are_refused(tmp_path: Path) -> None:
     _draw_mask(_write_pair(tmp_path / "pair", 1) / "left_Blur.png")
-    expect_error(r"left\.png: .*left_Blur\.png, left_blur\.png", load_pairs, tmp_path / "pair")
+    expect_error(r"left\.png: .*left_Blur\.png, left_blur\.png", load_sets, tmp_path / "pair")
 
 
 def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
@@ -234,14 +234,14 @@ def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
         _draw_mask(folder / name, kind="mask")
         content["poses"][("left.png", "right.png")[number]]["mask"] = name
     (folder / "poses.json").write_text(json.dumps(content))
-    assert not load_pairs(folder)[0].load_context(HEIGHT).masks.all()
+    assert not load_sets(folder)[0].load_context(HEIGHT).masks.all()
 
 
 def test_a_scene_file_is_no_mask(tmp_path: Path) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     for name in ("blur.ply", "mask.compressed.ply", "left_blur.spz"):
         (folder / name).write_bytes(b"")
-    assert len(load_pairs(folder)) == 1
+    assert len(load_sets(folder)) == 1
 
 
 @pytest.mark.parametrize("source", ["file", "poses.json", "pose folder"])
@@ -252,7 +252,7 @@ def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
         content = json.loads((folder / "poses.json").read_text())
         content["poses"][mask.name] = content["poses"]["left.png"]
         (folder / "poses.json").write_text(json.dumps(content))
-    read = Pose(folder).run if source == "pose folder" else lambda: load_pairs(mask if source == "file" else folder)
+    read = Pose(folder).run if source == "pose folder" else lambda: load_sets(mask if source == "file" else folder)
     expect_error(f"{mask.name}: needed", read)
 
 
@@ -322,7 +322,7 @@ ASSEMBLED = {
 
 
 def _load_first(folder: Path) -> Panorama:
-    return load_pairs(folder)[0].context[0]
+    return load_sets(folder)[0].context[0]
 
 
 @pytest.mark.parametrize("kind", ASSEMBLED)
@@ -332,7 +332,7 @@ def test_a_blur_mask_of_a_picture_is_refused_and_the_mask_of_its_panorama_is_nam
     write, name = ASSEMBLED[kind]
     folder = write(tmp_path / "set", color_face, 1)
     mask = _draw_mask(folder / name, COVER)
-    expect_error(rf"{mask.name}: needed .*(hall|0000_a)_blur", load_pairs, folder)
+    expect_error(rf"{mask.name}: needed .*(hall|0000_a)_blur", load_sets, folder)
     mask.unlink()
     _draw_mask(folder / f"{load_panoramas(folder)[0].name}_blur.png")
     assert find_blur_mask(_load_first(folder).image)
@@ -344,11 +344,11 @@ def test_a_scene_mask_beside_a_perspective_picture_masks_it_and_that_of_a_cube_f
 ) -> None:
     folder = _write_set(tmp_path / "set", color_face, 1)
     _draw_mask(folder / "images" / "0000_a_Front_mask.png", COVER, kind="mask")
-    masks = load_pairs(folder)[0].load_context(64).masks
+    masks = load_sets(folder)[0].load_context(64).masks
     assert not masks[0, 34, 64] and masks[0, :, :32].all() and masks[1].all()
     folder = _write_faces(tmp_path / "faces", color_face, 1)
     _draw_mask(folder / "hall_f_mask.png", COVER, kind="mask")
-    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_pairs, folder)
+    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_sets, folder)
 
 
 @pytest.mark.parametrize(
@@ -367,7 +367,7 @@ def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(
     mask = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1) / name
     mask.parent.mkdir(exist_ok=True)
     Image.new("L", (48, 48)).save(mask)
-    expect_error(f"{mask.name}: needed.*{got}", load_pairs, tmp_path / "set")
+    expect_error(f"{mask.name}: needed.*{got}", load_sets, tmp_path / "set")
 
 
 @pytest.mark.parametrize("name", ["0000_a_front.png.png", "0000_A_front.PNG.png", "0000_a_front.png"])
@@ -376,7 +376,7 @@ def test_the_folder_masks_is_applied(tmp_path: Path, kind: str, name: str, color
     folder = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1)
     _draw_mask(folder / "masks" / name, COVER, kind="mask")
     with pytest.warns(InputWarning, match="in no picture"):
-        assert not load_pairs(folder)[0].load_context(64).masks[0, 34, 64]
+        assert not load_sets(folder)[0].load_context(64).masks[0, 34, 64]
 
 
 def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path, color_face: Callable) -> None:
@@ -384,14 +384,14 @@ def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path, color_face: Ca
     content = json.loads(file.read_text())
     content["frames"][3]["mask_path"] = "masks/a.png"
     file.write_text(json.dumps(content))
-    expect_error(r"frame 3: .*masks/a\.png", load_pairs, file.parent)
+    expect_error(r"frame 3: .*masks/a\.png", load_sets, file.parent)
 
 
 def test_a_mask_beside_a_rig_is_that_of_its_panorama(tmp_path: Path, color_face: Callable) -> None:
     folder = _write_set(tmp_path / "set", color_face, 1)
     _draw_mask(folder / "0000_a_mask.png", kind="mask")
     _draw_mask(folder / "0001_A_Blur.PNG")
-    panoramas = load_pairs(folder)[0].context
+    panoramas = load_sets(folder)[0].context
     assert panoramas[0].mask == folder / "0000_a_mask.png" and panoramas[1].mask is None
     assert find_blur_mask(panoramas[1].image) == folder / "0001_A_Blur.PNG"
 
@@ -410,7 +410,7 @@ def test_masks_beside_a_link_are_applied_and_those_beside_its_file_are_refused(t
     _link(folder / "left.png", moved)
     assert find_blur_mask(_load_first(folder).image) == folder / "left_blur.png"
     (folder / "left_blur.png").rename(tmp_path / "store" / "left_blur.png")
-    expect_error(r"store/left_blur\.png: needed", load_pairs, folder)
+    expect_error(r"store/left_blur\.png: needed", load_sets, folder)
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
@@ -427,7 +427,7 @@ def test_a_name_has_its_mask_in_both_forms_of_unicode(tmp_path: Path, forms: tup
 def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
     tmp_path: Path, kind: str, name: str, color_face: Callable, sphere_predictor: Callable[[], object]
 ) -> None:
-    def list_keys(pair: Pair) -> tuple[str, ...]:
+    def list_keys(pair: PanoramaSet) -> tuple[str, ...]:
         """Those of predictions, of estimated poses, and of pages."""
         return hash_context(pair), _hash_inputs(pair.context, 1.5), hash_parts(*map(hash_panorama, pair.context))
 
@@ -441,7 +441,7 @@ def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
         before = mask.rename(tmp_path / "mask.png")
         keys = []
         for _ in range(2):
-            (pair,) = load_pairs(folder)
+            (pair,) = load_sets(folder)
             scenes.append(pipeline.predict(pair, predictor, height=HEIGHT).gaussians)  # type: ignore[arg-type]
             keys.append((*list_keys(pair), predictor.calls))  # type: ignore[attr-defined]
             if not mask.exists():
@@ -470,6 +470,6 @@ def test_a_web_tour_names_the_picture_of_its_masks(tmp_path: Path) -> None:
     tour = {"scenes": {"kitchen": {"type": "equirectangular", "panorama": "panos/IMG_1.png"}}}
     (tmp_path / "tour.json").write_text(json.dumps(tour))
     _draw_mask(tmp_path / "kitchen_blur.png")
-    expect_error(r"kitchen_blur\.png: .*IMG_1_blur\.png", load_pairs, tmp_path)
+    expect_error(r"kitchen_blur\.png: .*IMG_1_blur\.png", load_sets, tmp_path)
     (tmp_path / "kitchen_blur.png").rename(tmp_path / "panos" / "IMG_1_Blur.PNG")
     assert find_blur_mask(_load_first(tmp_path).image) == tmp_path / "panos" / "IMG_1_Blur.PNG"

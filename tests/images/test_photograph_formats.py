@@ -17,7 +17,7 @@ from refusals import expect_error
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.image_files import read_panorama, read_size, read_thumbnail, write_image
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 
 SIZE = 64
 
@@ -39,7 +39,7 @@ def _check(path: Path, pixels: Array, tolerance: float) -> None:
     assert opaque.all()
     assert np.abs(image.permute(1, 2, 0).numpy() * 255 - pixels).max() <= tolerance
     assert read_thumbnail(path, SIZE // 2).shape == (3, SIZE // 2, SIZE)
-    (pair,) = load_pairs(path)
+    (pair,) = load_sets(path)
     assert pair.image_height == SIZE
 
 
@@ -131,7 +131,7 @@ def test_parts_of_panoramas_and_other_projections_are_refused_by_what_they_state
         ("b", r"180 x 90 degrees of 360 x 180"),
         ("c", r"the projection 'cylindrical' \(GPano:ProjectionType\); convert it"),
     ):
-        for read in (load_pairs, lambda path: read_panorama(path, 16), lambda path: read_thumbnail(path, 16)):
+        for read in (load_sets, lambda path: read_panorama(path, 16), lambda path: read_thumbnail(path, 16)):
             expect_error(rf"{name}\.jpg: .*, got {problem}", read, tmp_path / f"{name}.jpg")
 
 
@@ -156,11 +156,11 @@ def test_dual_fisheye_pictures_are_named(tmp_path: Path, pixels: Array) -> None:
     Image.fromarray(_fisheye(64, 2)).save(tmp_path / "R0010001.JPG", quality=90)
     for call in (
         lambda: read_panorama(tmp_path / "R0010001.JPG", 32),
-        lambda: load_pairs(tmp_path)[0].load_context(32),
+        lambda: load_sets(tmp_path)[0].load_context(32),
     ):
         expect_error(r"R0010001\.JPG: .*got a dual fisheye picture; stitch it.*v360=dfisheye", call)
     Image.fromarray(_fisheye(64, 1)).save(tmp_path / "one.jpg")
-    expect_error("stitch a fisheye picture with the program of its camera", load_pairs, tmp_path / "one.jpg")
+    expect_error("stitch a fisheye picture with the program of its camera", load_sets, tmp_path / "one.jpg")
     capped = pixels.copy()  # panoramas with black poles are no fisheye pictures
     capped[:12] = capped[-12:] = 0
     for number, picture in enumerate((capped, pixels // 8, np.zeros_like(pixels))):
@@ -176,10 +176,10 @@ def test_files_of_cameras_and_videos_name_what_to_do(tmp_path: Path) -> None:
     ):
         (tmp_path / name).write_bytes(b"x")
         for path in (tmp_path, tmp_path / name):
-            expect_error(message, load_pairs, path)
+            expect_error(message, load_sets, path)
         (tmp_path / name).unlink()
     (tmp_path / "poses.csv").write_text("x,y,z")
-    expect_error(r"got none, and poses\.csv, of no known format; .*docs/input\.md lists", load_pairs, tmp_path)
+    expect_error(r"got none, and poses\.csv, of no known format; .*docs/input\.md lists", load_sets, tmp_path)
 
 
 def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:
@@ -191,7 +191,7 @@ def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:
         ),
         pytest.raises(InputError, match="name them NAME_f NAME_r NAME_b NAME_l NAME_u NAME_d"),
     ):
-        load_pairs(tmp_path)
+        load_sets(tmp_path)
 
 
 def _posed(folder: Path, heights: dict[str, int], **entries: object) -> Path:
@@ -208,7 +208,7 @@ def _posed(folder: Path, heights: dict[str, int], **entries: object) -> Path:
 
 
 def test_panoramas_of_different_sizes_are_one_pair(tmp_path: Path) -> None:
-    (pair,) = load_pairs(_posed(tmp_path / "room", {"a.png": 48, "b.jpg": 32}))
+    (pair,) = load_sets(_posed(tmp_path / "room", {"a.png": 48, "b.jpg": 32}))
     assert pair.image_height == 32
     assert pair.load_context(32).images.shape == (2, 3, 32, 64)
 
@@ -216,12 +216,12 @@ def test_panoramas_of_different_sizes_are_one_pair(tmp_path: Path) -> None:
 def test_a_pose_without_its_picture_and_a_missing_depth_are_notes(tmp_path: Path) -> None:
     folder = _posed(tmp_path / "room", {"a.png": 32, "b.png": 32}, gone={"cam2world": np.eye(4).tolist()})
     with pytest.warns(InputWarning, match=r"left out: .*poses\.json: needed the image .*gone, got no such file"):
-        (pair,) = load_pairs(folder)
+        (pair,) = load_sets(folder)
     assert [view.name for view in pair.context] == ["a", "b"]
     content = json.loads((folder / "poses.json").read_text())
     del content["poses"]["gone"]
     content["poses"]["a.png"]["depth"] = "depth/a.exr"
     (folder / "poses.json").write_text(json.dumps(content))
     with pytest.warns(InputWarning, match=r"'a\.png': its depth is left out: there is no file .*a\.exr"):
-        (pair,) = load_pairs(folder)
+        (pair,) = load_sets(folder)
     assert pair.context[0].depth is None

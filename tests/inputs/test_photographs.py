@@ -9,7 +9,7 @@ from PIL import Image
 
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.folders import load_panoramas
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.photographs import write_notes
 
 

@@ -10,7 +10,7 @@ from pytest import approx
 
 from pansplat.errors import InputWarning
 from pansplat.gaussians.scene import Scene, empty_gaussians
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat.tours.graph import find_tours, merge_scenes
 
 
@@ -28,7 +28,7 @@ def test_an_approximate_place_is_as_far_away_in_every_unit_of_measured_poses(tmp
         content |= {"worlds": worlds, "estimate": stated}
         (folder / "poses.json").write_text(json.dumps(content))
         with pytest.warns(InputWarning, match=r"no pose of c\.png"):
-            (tour,) = find_tours(load_pairs(folder))
+            (tour,) = find_tours(load_sets(folder))
         centers = tour.positions @ tour.level_axes[:, (0, 2)]
         away = tour.approximate[2].move(centers[2]) - centers[0]
         assert tour.panoramas[2].name == "c" and np.linalg.norm(away) == approx(3)

@@ -14,7 +14,7 @@ from pansplat.networks.depth_network import DepthNetworkConfig
 from pansplat.networks.depth_refinement import DepthRefinement, RefinementConfig
 from pansplat.networks.depth_sharpening import DepthSharpening, SharpeningConfig
 from pansplat.networks.weights import pack_weights, save_weights
-from pansplat.pipeline import load_model, load_pairs, load_predictor, predict, render
+from pansplat.pipeline import load_model, load_predictor, load_sets, predict, render
 from pansplat.prediction_options import PredictOptions
 from pansplat.sweep.guided_sweep import NetworkPrior, default_weights, load_guided_sweep, save_network
 from pansplat.sweep.prior import DepthPrior
@@ -147,7 +147,7 @@ def test_prediction_takes_any_number_of_views(weights):
 
 @pytest.mark.slow
 def test_shipped_model_estimates_the_sample_within_a_fifth():
-    (pair,) = load_pairs(Path(__file__).parents[2] / "assets" / "living_room")
+    (pair,) = load_sets(Path(__file__).parents[2] / "assets" / "living_room")
     views = pair.load_context(128)
     images = [image.permute(1, 2, 0).numpy() for image in views.images]
     observed = load_model("default").prior.observe(images)
@@ -159,7 +159,7 @@ def test_shipped_model_estimates_the_sample_within_a_fifth():
 
 @pytest.fixture(scope="module")
 def sample():
-    (pair,) = load_pairs(Path(__file__).parents[2] / "assets" / "living_room")
+    (pair,) = load_sets(Path(__file__).parents[2] / "assets" / "living_room")
     return pair.load_context(64), pair.load_targets(64), load_model("default")
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 import pansplat
 from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.gaussians.scene import Gaussians
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.sweep import Sweep
 from pansplat.sweep.search import SearchConfig
 from pansplat.system.progress import show_progress
@@ -179,7 +179,7 @@ def test_the_fingerprint_depends_on_the_settings():
     assert Sweep().name == "sweep" and Sweep().fingerprint.startswith("sweep-")
 
 
-def _decibels(pair: Pair, height: int) -> tuple[float, float]:
+def _decibels(pair: PanoramaSet, height: int) -> tuple[float, float]:
     """WS-PSNR of the middle view, by the sweep and by the cross-fade."""
     context, targets = pair.load_context(height), pair.load_targets(height)
     scene = pansplat.predict(pair, height=height, cache=False)
@@ -193,7 +193,7 @@ def _decibels(pair: Pair, height: int) -> tuple[float, float]:
 @pytest.mark.shared
 @pytest.mark.slow
 def test_the_middle_view_of_a_scanned_room_is_rendered(shared: Path):
-    (pair,) = (pair for pair in pansplat.load_pairs(shared / "data/mp3d_sample") if pair.targets)
+    (pair,) = (pair for pair in pansplat.load_sets(shared / "data/mp3d_sample") if pair.targets)
     reached, faded = _decibels(pair, 128)
     assert reached >= 26.0  # 26.7 measured
     assert reached >= faded + 9.5
@@ -202,7 +202,7 @@ def test_the_middle_view_of_a_scanned_room_is_rendered(shared: Path):
 @pytest.mark.shared
 @pytest.mark.slow
 def test_photographed_homes_are_rendered_better_than_by_a_cross_fade(shared: Path):
-    pairs = [pair for pair in pansplat.load_pairs(shared / "data/zind") if pair.targets]
+    pairs = [pair for pair in pansplat.load_sets(shared / "data/zind") if pair.targets]
     figures = torch.tensor([_decibels(pair, 64) for pair in pairs])
     assert len(pairs) == 3
     assert (figures[:, 0] > figures[:, 1]).all()

@@ -41,7 +41,7 @@ FINGERPRINTS = {
     "default": lambda: hash_sources("pansplat.sweep.guided_sweep"),
     "network": lambda: hash_sources("pansplat.model.network"),
     "refinement": refinement_fingerprint,
-    "pixels": lambda: hash_sources("pansplat.inputs.pairs"),
+    "pixels": lambda: hash_sources("pansplat.inputs.panorama_sets"),
     "poses": lambda: _hash_inputs([], 1.5),
 }
 SOURCES = {

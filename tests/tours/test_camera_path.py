@@ -10,7 +10,7 @@ import torch
 from pansplat.errors import InputError
 from pansplat.geometry.path import turn_axes
 from pansplat.geometry.world import WorldFrame
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.camera_path import CameraPath, KeyFrame, read_path, write_path
 from pansplat.tours.graph import TourGraph
 

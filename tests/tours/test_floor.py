@@ -9,7 +9,7 @@ import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.gaussians.scene import Scene
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours import floor
 from pansplat.tours.floor import find_floor_outline
 from pansplat.tours.graph import TourGraph, make_graph

@@ -11,7 +11,7 @@ import torch
 from synthetic_scenes import make_balls
 
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.inputs.placements import ApproximatePlace, Placement
 from pansplat.tours import graph
 from pansplat.tours.graph import TourGraph, find_tours
@@ -25,8 +25,8 @@ def test_pairs_that_share_panoramas_are_one_tour(make_tour):
     a, b, c, d, e = make_tour([(0, z) for z in range(5)], ()).panoramas
     siblings = tuple(p.image for p in (e, c, b, a, d))
 
-    def pair(*context: Panorama) -> Pair:
-        return Pair("", Path("house"), context, (), 0.45, 10.0, siblings)
+    def pair(*context: Panorama) -> PanoramaSet:
+        return PanoramaSet("", Path("house"), context, (), 0.45, 10.0, siblings)
 
     assert find_tours([pair(a, b), pair(d, e)]) == []
     (tour,) = find_tours([pair(a, b), pair(d, e), pair(b, c)])
@@ -95,37 +95,39 @@ def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
     scenes = home.choose_scene_views()
     assert scenes[3, 3] == (3,) and scenes[4, 5] == (4, 5) and set(home.choose_sources()) == set(scenes.values())
     assert home.neighbours(3) == []
-    pairs = [home.make_pair((node,)) for node in (3, 6)]
+    pairs = [home.make_set((node,)) for node in (3, 6)]
     (tour,) = find_tours(pairs)
     assert set(tour.overlaps) == {(0, 0), (1, 1)}, "two photographs are a tour of two parts"
-    assert find_tours(pairs[:1]) == [] and find_tours([home.make_pair((0, 1))]) == []
+    assert find_tours(pairs[:1]) == [] and find_tours([home.make_set((0, 1))]) == []
     elsewhere = dataclasses.replace(pairs[1], folder=Path("other"))
     assert find_tours([pairs[0], elsewhere]) == [], "each folder has its own tour"
 
 
 def test_single_views_are_between_the_other_panoramas_of_a_tour_in_file_order(make_tour):
     a, b, c = make_tour([(0, 0), (0, 1), (0, 2)], ()).panoramas
-    together = Pair("", Path("house"), (a, c), (), 0.45, 10.0, (a.image, c.image))
-    alone = Pair("", Path("house"), (dataclasses.replace(b, world=1),), (), 0.45, 10.0, (a.image, b.image, c.image))
+    together = PanoramaSet("", Path("house"), (a, c), (), 0.45, 10.0, (a.image, c.image))
+    alone = PanoramaSet(
+        "", Path("house"), (dataclasses.replace(b, world=1),), (), 0.45, 10.0, (a.image, b.image, c.image)
+    )
     (tour,) = find_tours([together, alone])
     assert [panorama.name for panorama in tour.panoramas] == ["p0", "p1", "p2"] and tour.parts == (0, 1, 0)
-    assert set(tour.overlaps) == {(0, 2), (1, 1)} and tour.make_pair((0, 2)).context == (a, c)
+    assert set(tour.overlaps) == {(0, 2), (1, 1)} and tour.make_set((0, 2)).context == (a, c)
 
 
 def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home):
-    together, alone = home.make_pair((0, 1)), home.make_pair((3,))
+    together, alone = home.make_set((0, 1)), home.make_set((3,))
     (tour,) = find_tours([dataclasses.replace(together, near=0.8, far=4.0), alone])
     assert (tour.near, tour.far) == (0.8, 4.0) and (alone.near, alone.far) == (0.45, 10.0)
-    single = tour.make_pair((len(tour) - 1,))
+    single = tour.make_set((len(tour) - 1,))
     assert len(single.context) == 1 and (single.near, single.far) == (0.45, 10.0), "its walls may be nearer"
-    (tour,) = find_tours([alone, home.make_pair((6,))])
+    (tour,) = find_tours([alone, home.make_set((6,))])
     assert (tour.near, tour.far) == (0.45, 10.0)
 
 
 def test_a_panorama_in_no_pair_is_a_part_of_its_own_at_its_place(make_tour):
     a, b, c = make_tour(((0, 0), (0, 1), (3, 0)), ()).panoramas
     images = (a.image, b.image, c.image)
-    (tour,) = find_tours([Pair("", Path(), context, (), 0.45, 10.0, images) for context in ((a, b), (c,))])
+    (tour,) = find_tours([PanoramaSet("", Path(), context, (), 0.45, 10.0, images) for context in ((a, b), (c,))])
     assert tour.parts == (0, 0, 1) and set(tour.overlaps) == {(0, 1), (2, 2)}
     assert np.allclose(tour.positions, [(0, 0, 0), (0, 0, 1), (3, 0, 0)]), "they have a common world"
 
@@ -138,7 +140,7 @@ def test_worlds_are_level_and_far_apart(home):
     axes = home.cam2world[:, :3, :3].numpy()
     assert np.allclose(axes, np.eye(3)), "up is up, and the first panorama of each world looks ahead"
     assert np.allclose(home.positions[:, 1], 0), "the cameras have one height"
-    pair = home.make_pair((4, 5))
+    pair = home.make_set((4, 5))
     (place, _), poses = pair.context, torch.stack([panorama.cam2world for panorama in pair.context])
     assert np.allclose(place.cam2world[:3, 3], (5, 5, 0)), "scenes are predicted in their own world"
     means = poses[:, :3, 3].float() + place.cam2world[:3, 2].float()  # 1 m ahead
@@ -155,7 +157,7 @@ def test_worlds_are_level_and_far_apart(home):
 def test_two_hundred_parts_stay_near_each_other(make_tour):
     single = make_tour(((0, 0),), ()).panoramas[0]
     panoramas = tuple(dataclasses.replace(single, image=Path(f"{k}.jpg"), world=k) for k in range(200))
-    (tour,) = find_tours([Pair("", Path(), (panorama,), (), 0.45, 10.0, ()) for panorama in panoramas])
+    (tour,) = find_tours([PanoramaSet("", Path(), (panorama,), (), 0.45, 10.0, ()) for panorama in panoramas])
     assert np.ptp(tour.positions, axis=0).max() < 250 and len(tour.plan_walk()) == 200
 
 
@@ -326,7 +328,7 @@ def test_a_way_begins_at_the_better_end_of_the_nearest_edge(comb):
 
 
 def test_a_pair_of_a_scene_has_its_panoramas(comb):
-    pair = comb.make_pair((1, 4))
+    pair = comb.make_set((1, 4))
     assert pair.name == "p1-p4" and pair.context == (comb.panoramas[1], comb.panoramas[4])
     assert (pair.near, pair.far, pair.targets) == (0.45, 10.0, ())
 

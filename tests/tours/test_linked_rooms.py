@@ -11,7 +11,7 @@ import shapely
 import torch
 from numpy.testing import assert_allclose
 
-from pansplat.inputs.pairs import Link, Panorama
+from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.tours.graph import DrawnPlace, TourGraph
 from pansplat.tours.linked_rooms import place_rooms
 

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.panorama_sets import Link
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.links import find_link_ring
 from pansplat.tours.outlook import BINS, find_bin

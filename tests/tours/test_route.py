@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 from pansplat.geometry.path import turn_axes
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import TourGraph, find_tours
 from pansplat.tours.route import Moment, Route, find_offset, plan_route
@@ -213,5 +213,5 @@ def _load_home(folder: Path, unit: float = 1.0, origin: tuple[float, float, floa
         poses[f"{number}.png"] = pose.tolist()
     content = {"convention": "cam2world opencv", "near": 0.45 * unit, "far": 10.0 * unit, "poses": poses}
     (folder / "poses.json").write_text(json.dumps(content))
-    (tour,) = find_tours(load_pairs(folder))
+    (tour,) = find_tours(load_sets(folder))
     return tour

@@ -21,7 +21,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.images.image_files import write_image
-from pansplat.inputs.pairs import Link, Pair, Panorama
+from pansplat.inputs.panorama_sets import Link, Panorama, PanoramaSet
 from pansplat.rendering import Rendering, rasterize
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
@@ -303,7 +303,7 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     assert tour is not None
     if not entry.views:
         views = next(iter(tour.choose_scene_views().values()))
-        entry = SceneEntry(entry.name, pair=tour.make_pair(views), tour=tour, views=views)
+        entry = SceneEntry(entry.name, pair=tour.make_set(views), tour=tour, views=views)
     directions, cam2world = fibonacci_directions(500), tour.cam2world[list(entry.views)]
     color = torch.tensor((0.3, 0.5, 0.7)).roll(sum(entry.views)) + 0.2 * directions
     parts = [
@@ -329,11 +329,11 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
 
 
 @pytest.fixture(scope="session")
-def pair(axis_photos, small_scene, tmp_path_factory) -> Pair:
+def pair(axis_photos, small_scene, tmp_path_factory) -> PanoramaSet:
     """The two photographs at the cameras of the small scene."""
     folder = tmp_path_factory.mktemp("pair")
     panoramas = []
     for name, image, pose in zip(small_scene.names, axis_photos, small_scene.cam2world, strict=True):
         write_image(folder / name, image)
         panoramas.append(Panorama(name, folder / name, pose))
-    return Pair("pair", folder, tuple(panoramas), (), 0.45, 10.0)
+    return PanoramaSet("pair", folder, tuple(panoramas), (), 0.45, 10.0)

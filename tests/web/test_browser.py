@@ -35,7 +35,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.pairs import Note, Pair
+from pansplat.inputs.panorama_sets import Note, PanoramaSet
 from pansplat.notebook import _bundle_scene
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
@@ -178,7 +178,7 @@ def faulty(folder: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def photographs(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> list[Pair]:
+def photographs(scene: Scene, take_photographs: Callable[..., list[PanoramaSet]]) -> list[PanoramaSet]:
     """Of the scene, 1024 rows; the second one has a note ahead on the right, the third one another."""
     taken = take_photographs(scene, 1024)
     notes = (
@@ -197,8 +197,8 @@ def folder(
     house: Scene,
     flat: Scene,
     sites: Sites,
-    photographs: list[Pair],
-    take_photographs: Callable[..., list[Pair]],
+    photographs: list[PanoramaSet],
+    take_photographs: Callable[..., list[PanoramaSet]],
 ) -> Path:
     """tour.html, split.html with files, house.html with a graph, flat.html with parts.
 
@@ -363,12 +363,12 @@ def room() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def room_photographs(room: Scene, take_photographs: Callable[..., list[Pair]]) -> list[Pair]:
+def room_photographs(room: Scene, take_photographs: Callable[..., list[PanoramaSet]]) -> list[PanoramaSet]:
     return take_photographs(room, 256)
 
 
 @pytest.fixture(scope="module")
-def room_page(room: Scene, room_photographs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room_page(room: Scene, room_photographs: list[PanoramaSet], tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("room") / "doll.html"
     write_page(room, path, photographs=room_photographs)
     return path
@@ -392,7 +392,7 @@ def test_the_dolls_house_opens_when_the_gaussians_have_arrived(chromium: Any, ro
 
 
 def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_back_inside(
-    chromium: Any, room: Scene, room_photographs: list[Pair], room_page: Path
+    chromium: Any, room: Scene, room_photographs: list[PanoramaSet], room_page: Path
 ) -> None:
     photographs, rooms = room_photographs, find_rooms(TourFacts(room))
     origin, cameras = room.cam2world[:, :3, 3].mean(0).numpy(), room.cam2world[:, :3, 3].numpy()
@@ -516,7 +516,7 @@ def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_ch
 
 
 def test_a_page_of_small_and_large_units_is_that_of_metres(
-    chromium: Any, folder: Path, scene: Scene, photographs: list[Pair], tmp_path: Path
+    chromium: Any, folder: Path, scene: Scene, photographs: list[PanoramaSet], tmp_path: Path
 ) -> None:
     seen, plans = [], []
     for unit in (1.0, 1e3, 1e-3):
@@ -702,7 +702,7 @@ def test_a_note_of_the_tour_is_a_marker_at_its_panorama_that_opens_plain_text(
         assert page.messages == []
 
 
-def look_at_photograph(photograph: Pair, level: np.ndarray, camera: dict[str, Any]) -> np.ndarray:
+def look_at_photograph(photograph: PanoramaSet, level: np.ndarray, camera: dict[str, Any]) -> np.ndarray:
     """The picture of a photograph for a camera of the page at its panorama; the mean of 3x3 samples of a pixel."""
     cy, sy, cp, sp = (f(camera[angle]) for angle in ("yaw", "pitch") for f in (math.cos, math.sin))
     turn = np.array(((cy, 0, sy), (0, 1, 0), (-sy, 0, cy))) @ np.array(((1, 0, 0), (0, cp, -sp), (0, sp, cp)))
@@ -719,7 +719,7 @@ def look_at_photograph(photograph: Pair, level: np.ndarray, camera: dict[str, An
 
 @pytest.mark.parametrize("name", ["photos.html", "photos/index.html"])
 def test_at_a_panorama_the_page_shows_its_photograph_and_gaussians_elsewhere(
-    chromium: Any, folder: Path, scene: Scene, photographs: list[Pair], name: str
+    chromium: Any, folder: Path, scene: Scene, photographs: list[PanoramaSet], name: str
 ) -> None:
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     with opened(chromium, folder / name) as page:
@@ -1066,7 +1066,7 @@ def test_the_page_works_when_the_first_view_has_arrived(chromium: Any, folder: P
 
 @pytest.mark.parametrize("name", ["photos.html", "photos/index.html"])
 def test_the_photograph_is_shown_before_any_gaussians_arrive(
-    chromium: Any, folder: Path, photographs: list[Pair], name: str
+    chromium: Any, folder: Path, photographs: list[PanoramaSet], name: str
 ) -> None:
     with opened(chromium, folder / name, script=WITHOUT_GAUSSIANS, is_stepped=True) as page:  # and is ready
         node, start, level = page.run("HEADER.loading[0]"), page.camera["position"], np.array(page.run("HEADER.level"))

@@ -18,7 +18,7 @@ import torch
 
 from pansplat.export.page_data import PageConstants, PageHeader
 from pansplat.geometry.pose import blend_weights
-from pansplat.inputs.pairs import Link, Panorama
+from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
 
 FOLDER = Path(str(resources.files("pansplat.web")))

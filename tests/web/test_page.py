@@ -30,7 +30,7 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.refinement.budget import merge_to
 from pansplat.system.atomic import replacing
 from pansplat.tours import edges
@@ -198,7 +198,7 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
 
 
 def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(
-    flat: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]]
+    flat: Scene, tmp_path: Path, take_photographs: Callable[..., list[PanoramaSet]]
 ) -> None:
     photographs = take_photographs(flat, 64)
     write_page(flat, tmp_path / "tour.html", photographs=photographs)
@@ -429,7 +429,7 @@ def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Pat
 
 
 def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussians(
-    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], tmp_path: Path
 ) -> None:
     write_page(scene, tmp_path / "tour.html", photographs=take_photographs(scene, 1024))
     header = read_header(tmp_path / "tour.html")

@@ -20,7 +20,7 @@ from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair, Panorama
+    from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
     from pansplat.tours.facts import TourFacts
     from pansplat.tours.graph import TourGraph
 
@@ -48,7 +48,7 @@ class SceneEntry:
     """
 
     name: str  # shown in the list of scenes and used for output folders
-    pair: "Pair | None" = None
+    pair: "PanoramaSet | None" = None
     file: Path | None = None  # the scene file, or None
     tour: "TourGraph | None" = None  # the tour, or None
     views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
@@ -103,10 +103,10 @@ def find_entries(
     if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if is_scene_file(p)) if path.is_dir() else []
-    from pansplat.pipeline import load_pairs, load_predictor, warn_of_single_views
+    from pansplat.pipeline import load_predictor, load_sets, warn_of_single_views
     from pansplat.tours.graph import find_tours
 
-    def on_unposed(pairs: "list[Pair]") -> None:
+    def on_unposed(pairs: "list[PanoramaSet]") -> None:
         if show is not None:
             show([SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)])
         report_progress("finding where they were taken", 0.0)
@@ -114,7 +114,7 @@ def find_entries(
     pairs = []
     with collect_notes() as notes:
         try:
-            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
+            pairs = load_sets(path, on_unposed=on_unposed, **vars(reading))
         except InputError as error:
             if not scenes:
                 raise
@@ -234,7 +234,7 @@ def _load_tour_scene(
         elif views != part:
             prediction = replace(prediction, refine_steps=0)
         entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
-    pair = entry.pair or tour.make_pair(views)
+    pair = entry.pair or tour.make_set(views)
     fitted = pipeline.fit_to_scene(prediction, pair)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:

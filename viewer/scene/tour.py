@@ -116,7 +116,7 @@ class TourScenes:
 
     def make_entry(self, views: ViewNumbers) -> SceneEntry:
         """The prediction of these panoramas as an entry for the loader."""
-        pair = self.tour.make_pair(views)
+        pair = self.tour.make_set(views)
         name = pair.name if len(views) <= MAX_SCENE_VIEWS else f"{len(views)} panoramas"
         return SceneEntry(name, pair=pair, tour=self.tour, views=views)
 

@@ -24,7 +24,7 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.images.blur_masks import MASK_SUFFIX, find_mask_beside, fold_name
 from pansplat.images.image_files import READABLE_SUFFIXES
 from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
-from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
+from pansplat.inputs.panorama_sets import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.inputs.poses import read_number, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import find_inside
 from pansplat.system.components import label_components

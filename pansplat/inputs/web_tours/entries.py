@@ -19,7 +19,7 @@ from msgspec import Meta
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
 from pansplat.images.cube_images import CubeImage, write_cube
-from pansplat.inputs.pairs import Link, Note, Panorama, find_mask
+from pansplat.inputs.panorama_sets import Link, Note, Panorama, find_mask
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.system.files import make_portable_name, make_unique_name, read_file
 from pansplat.system.strict_json import convert

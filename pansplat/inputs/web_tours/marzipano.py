@@ -20,7 +20,7 @@ from typing import Any
 from pansplat.errors import InputError, InputWarning
 from pansplat.images.cube_faces import find_gap
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.web_tours.entries import (
     Entry,
     Pixels,

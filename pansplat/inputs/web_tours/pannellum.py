@@ -24,7 +24,7 @@ from pansplat.errors import InputError, InputWarning
 from pansplat.images.cube_faces import find_gap, require_faces
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
 from pansplat.images.image_files import require_panorama
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.web_tours.entries import (
     MAX_BYTES,
     Entry,

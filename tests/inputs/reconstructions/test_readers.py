@@ -15,19 +15,19 @@ from refusals import expect_error
 from scipy.spatial.transform import Rotation
 
 from pansplat.errors import InputWarning
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 
 NAMES = ("p1.png", "p2.png", "p3.png")
 
 
-def load(folder: Path, *, arbitrary: bool = True) -> tuple[list[Pair], list[Panorama]]:
+def load(folder: Path, *, arbitrary: bool = True) -> tuple[list[PanoramaSet], list[Panorama]]:
     """The pairs of a folder, and their panoramas by name; a warning states that the unit is arbitrary."""
     if arbitrary:
         with pytest.warns(InputWarning, match=r"unit of its poses is arbitrary.*scale\.txt"):
-            pairs = load_pairs(folder)
+            pairs = load_sets(folder)
     else:
-        pairs = load_pairs(folder)
+        pairs = load_sets(folder)
     views = {view.name: view for pair in pairs for view in pair.context}
     return pairs, [views[name] for name in sorted(views)]
 
@@ -242,12 +242,12 @@ def test_colmap_equirectangular_cameras_project_as_pycolmap_does(
     distances = np.min([np.linalg.norm(points - pose[:3, 3], axis=1) for pose in cameras], axis=0)
     assert near == pytest.approx(np.quantile(distances, 0.01) / 2, rel=0.01)
     assert far == pytest.approx(np.quantile(distances, 0.99) * 2, rel=0.01)
-    assert load_pairs_quietly(model.parent.parent / "sparse" / "0" / f"images.{'txt' if kind == 'text' else 'bin'}")
+    assert load_sets_quietly(model.parent.parent / "sparse" / "0" / f"images.{'txt' if kind == 'text' else 'bin'}")
 
 
-def load_pairs_quietly(path: Path) -> list[Pair]:
+def load_sets_quietly(path: Path) -> list[PanoramaSet]:
     with pytest.warns(InputWarning, match="unit of its poses is arbitrary"):
-        return load_pairs(path)
+        return load_sets(path)
 
 
 @pytest.mark.parametrize("kind", ["binary", "text"])
@@ -297,7 +297,7 @@ def test_openmvg_spherical_views(
         check_pixels(panorama, np.stack((longitude / (2 * np.pi) + 0.5, -latitude / (2 * np.pi) * 2 + 0.5), axis=-1))
     content["intrinsics"][0]["value"]["polymorphic_name"] = "pinhole"
     (tmp_path / "sfm_data.json").write_text(json.dumps(content))
-    expect_error(r"sfm_data\.json: needed spherical views with poses, got 3 views, 3 poses and 0", load_pairs, tmp_path)
+    expect_error(r"sfm_data\.json: needed spherical views with poses, got 3 views, 3 poses and 0", load_sets, tmp_path)
 
 
 def test_opensfm_spherical_shots(
@@ -324,7 +324,7 @@ def test_opensfm_spherical_shots(
         check_pixels(panorama, np.stack((u + 0.5, 2 * v + 0.5), axis=-1))  # normalised by the width
     part["cameras"]["c"]["projection_type"] = "perspective"
     (tmp_path / "reconstruction.json").write_text(json.dumps([part]))
-    expect_error(r"reconstruction\.json: needed shots of a spherical camera, got none of 3", load_pairs, tmp_path)
+    expect_error(r"reconstruction\.json: needed shots of a spherical camera, got none of 3", load_sets, tmp_path)
 
 
 def test_metashape_spherical_cameras(
@@ -354,9 +354,9 @@ def test_metashape_spherical_cameras(
         np.testing.assert_allclose(panorama.cam2world, pose, atol=1e-9)
         check_pixels(panorama, equirect_uv((points - pose[:3, 3]) @ pose[:3, :3], X, -Y, Z))
     (tmp_path / "cameras.xml").write_text(text.replace('type="spherical"', 'type="frame"'))
-    expect_error(r"cameras\.xml: needed aligned cameras of a spherical sensor, got 3 aligned", load_pairs, tmp_path)
+    expect_error(r"cameras\.xml: needed aligned cameras of a spherical sensor, got 3 aligned", load_sets, tmp_path)
     (tmp_path / "cameras.xml").write_text(text[:-20])
-    expect_error(r"cameras\.xml: needed cameras exported by Metashape.*Export Cameras", load_pairs, tmp_path)
+    expect_error(r"cameras\.xml: needed cameras exported by Metashape.*Export Cameras", load_sets, tmp_path)
 
 
 def test_only_the_largest_component_of_metashape_is_one_world(
@@ -377,7 +377,7 @@ def test_only_the_largest_component_of_metashape_is_one_world(
         f"<cameras>{''.join(rows)}</cameras></chunk></document>"
     )
     with pytest.warns(InputWarning) as notes:
-        pairs = load_pairs(tmp_path)
+        pairs = load_sets(tmp_path)
     assert any("cameras.xml: 1 smaller reconstruction without" in str(note.message) for note in notes)
     worlds = {view.name: view.world for pair in pairs for view in pair.context}
     alone, *others = (worlds[name[:-4]] for name in NAMES)
@@ -417,13 +417,13 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
         ({"frames": [{key: frame[key] for key in ("file_path", "transform_matrix")}]}, "needed a focal length"),
     ):
         source.write_text(json.dumps(content))
-        expect_error(rf"transforms\.json.*{message}", load_pairs, tmp_path)
+        expect_error(rf"transforms\.json.*{message}", load_sets, tmp_path)
     source.unlink()
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text("1 OPENCV 48 48 24 24 24 24 0.1 0 0 0\n")
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 v.png\n\n")
-    expect_error(r"images\.txt, 'v\.png'.*without distortion, got OPENCV; undistort", load_pairs, tmp_path)
+    expect_error(r"images\.txt, 'v\.png'.*without distortion, got OPENCV; undistort", load_sets, tmp_path)
     for name in ("cameras", "images"):
         (model / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\1")
-    expect_error(r"sparse.0.cameras\.bin: .* damaged", load_pairs, tmp_path)
+    expect_error(r"sparse.0.cameras\.bin: .* damaged", load_sets, tmp_path)

@@ -15,8 +15,8 @@ from PIL import Image
 from pansplat.export import training_set
 from pansplat.export.training_set import write_dataset
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.inputs.reconstructions.nerfstudio import Z_UP
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -93,7 +93,7 @@ def test_a_round_trip_keeps_poses_and_pictures(
 ) -> None:
     if kind == "colmap":
         (dataset / "transforms.json").unlink()
-    pairs = load_pairs(dataset)  # scale.txt states metres: no note
+    pairs = load_sets(dataset)  # scale.txt states metres: no note
     panoramas = {view.name: view for pair in pairs for view in pair.context}
     assert sorted(panoramas) == ["0000_p_0", "0001_p_1", "0002_p_2"]
     for number, pose in enumerate(cameras):

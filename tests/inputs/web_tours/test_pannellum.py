@@ -13,7 +13,7 @@ from PIL import Image
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.folders import load_panoramas
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.web_tours import find_web_tours
 
 MULTIRES = {

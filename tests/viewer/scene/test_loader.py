@@ -86,11 +86,11 @@ def test_photographs_are_placed_by_camera_heights_in_the_unit_of_their_files(hou
 
 
 def test_warnings_about_the_input_are_notes_of_its_entries(monkeypatch, house):
-    def load_pairs(path, **options):
+    def load_sets(path, **options):
         warnings.warn("b.jpg: no pose was found", InputWarning, stacklevel=2)
-        return [house.make_pair((0, 1))]
+        return [house.make_set((0, 1))]
 
-    monkeypatch.setattr("pansplat.pipeline.load_pairs", load_pairs)
+    monkeypatch.setattr("pansplat.pipeline.load_sets", load_sets)
     with pytest.warns(InputWarning, match="no pose was found"):
         (entry,) = find_entries(house.folder, ReadOptions(), PredictOptions())
     assert entry.notes == ("b.jpg: no pose was found",)
@@ -141,8 +141,8 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     for (name, network), least in zip(networks.items(), (2, 1), strict=True):
         network.name, network.min_views = name, least
         monkeypatch.setitem(models._MODELS, name, lambda network=network: network)
-    monkeypatch.setattr("pansplat.pipeline.load_pairs", lambda path, **options: pairs)
-    pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
+    monkeypatch.setattr("pansplat.pipeline.load_sets", lambda path, **options: pairs)
+    pairs = [parted_house.make_set(views) for views in ((0, 1), (1, 2), (3,))]
     pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
     with pytest.warns(InputWarning, match="1 single view is predicted by default"):
         entries = find_entries(parted_house.folder, ReadOptions(), PredictOptions("pairs"))

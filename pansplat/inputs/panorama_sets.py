@@ -136,7 +136,7 @@ class Panorama:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class PanoramaSet:
     """Context and target panoramas of one scene; a scene of a single view has one context panorama.
 
     Image files are read by `load_context` and `load_targets`.
@@ -163,7 +163,7 @@ class Pair:
         if self.targets:
             parts.append(f"target{'s' if len(self.targets) > 1 else ''} {list_first([p.name for p in self.targets])}")
         parts.append(f"near and far {describe_range(self.near, self.far, 'm')}")
-        return f"<Pair {self.name}: {', '.join(parts)}, in {self.folder}>"
+        return f"<PanoramaSet {self.name}: {', '.join(parts)}, in {self.folder}>"
 
     @property
     def image_height(self) -> int:
@@ -267,7 +267,7 @@ class Collection:
         """Whether there are panoramas for an estimate of poses, and no poses."""
         return not self.panoramas and len(self.unposed) > 1
 
-    def pairs(self, near: float | None = None, far: float | None = None) -> list[Pair]:
+    def sets(self, near: float | None = None, far: float | None = None) -> list[PanoramaSet]:
         """One pair per group, those with targets first, then one of a single view for each other panorama.
 
         Warns about posed panoramas that are in no group.
@@ -290,7 +290,9 @@ class Collection:
         for indices in groups:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
-            pairs.append(Pair(name, folder, context, targets, *self._range(context[0].world, near, far), siblings))
+            pairs.append(
+                PanoramaSet(name, folder, context, targets, *self._range(context[0].world, near, far), siblings)
+            )
         used = {i for group in groups for part in group for i in part}
         alone = [panorama for i, panorama in enumerate(self.panoramas) if i not in used]
         if alone:
@@ -300,10 +302,12 @@ class Collection:
                 category=InputWarning,
                 stacklevel=4,
             )
-        pairs += [Pair(view.name, folder, (view,), (), *self._range(view.world, near, far), siblings) for view in alone]
+        pairs += [
+            PanoramaSet(view.name, folder, (view,), (), *self._range(view.world, near, far), siblings) for view in alone
+        ]
         first_world = 1 + max((panorama.world for panorama in self.panoramas), default=-1)
         every = tuple(heapq.merge(self.panoramas, self.unposed, key=lambda panorama: panorama.name))
-        single = single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
+        single = single_view_sets(self.unposed, folder, near, far, siblings=every, first_world=first_world)
         return [replace(pair, name=self.name or pair.name) for pair in single] if not pairs else pairs + single
 
     def _range(self, world: int, near: float | None, far: float | None) -> tuple[float, float]:
@@ -359,7 +363,7 @@ class Collection:
         return sorted(edges)
 
 
-def localize_pairs(pairs: Sequence[Pair], camera_height: float = CAMERA_HEIGHT) -> list[Pair]:
+def localize_sets(pairs: Sequence[PanoramaSet], camera_height: float = CAMERA_HEIGHT) -> list[PanoramaSet]:
     """The pairs of one camera height in working worlds (`WorldFrame`), one for all panoramas of a world of a folder."""
     worlds: dict[tuple[Path, int], list[tuple[Tensor, float]]] = {}
     for pair in pairs:
@@ -380,7 +384,7 @@ def localize_pairs(pairs: Sequence[Pair], camera_height: float = CAMERA_HEIGHT) 
     return localized
 
 
-def single_view_pairs(
+def single_view_sets(
     panoramas: Sequence[Panorama],
     folder: Path,
     near: float | None,
@@ -388,7 +392,7 @@ def single_view_pairs(
     *,
     siblings: Sequence[Panorama] | None = None,
     first_world: int = 0,
-) -> list[Pair]:
+) -> list[PanoramaSet]:
     """A pair of one view for each panorama.
 
     Args:
@@ -401,7 +405,7 @@ def single_view_pairs(
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')
     images = tuple(panorama.image for panorama in (panoramas if siblings is None else siblings))
     return [
-        Pair(view.name, folder, (replace(view, world=world),), (), near, far, images)
+        PanoramaSet(view.name, folder, (replace(view, world=world),), (), near, far, images)
         for world, view in enumerate(panoramas, start=first_world)
     ]
 
