@@ -6,37 +6,35 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
-from pansplat import pipeline
 from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, write_film
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
-from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
+from pansplat.tours.graph import TourGraph, make_graph
+from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route, plan_visits
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry, make_file_name
+from pansplat_viewer.core.settings import DrawSettings
+from pansplat_viewer.core.state import ViewerState, enter_scene, fit_settings
+from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, make_file_name
-from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.state import ViewerState, enter_scene, fit_settings
-from pansplat_viewer.scene.tour import TourScenes
 
-FIELD_OF_VIEW = 75.0  # of flights, vertical, degrees
-STILLS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the flight
+FIELD_OF_VIEW = 75.0  # of films, vertical, degrees
+_ORBIT_SECONDS, _ORBIT_STILLS = 4.0, 4  # duration of the film around a scene without cameras, and its stills
 
 
-def compute_flight_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
-    """Return the pose at a fraction of the scene's flight; a scene without cameras is orbited once."""
-    if len(scene.cam2world):
-        return fly_pose(scene.cam2world, fraction).numpy()
-    state = ViewerState()
+def orbit_scene(scene: Scene, fps: float, seconds: float | None) -> list[Shot]:
+    """The frames of a turn around a scene without cameras."""
+    state, height = ViewerState(), 1000
     enter_scene(state, scene)
-    height = 1000
-    return cameras.orbit(state.camera, (2 * height * fraction, 0.0), height).cam2world
+    shots = []
+    for fraction in np.linspace(0, 1, max(round((seconds or _ORBIT_SECONDS) * fps), 2)).tolist():
+        camera = cameras.orbit(state.camera, (2 * height * fraction, 0.0), height)
+        shots.append(Shot(camera.cam2world, FIELD_OF_VIEW, len(shots) / fps))
+    return shots
 
 
 @contextlib.contextmanager
@@ -95,51 +93,39 @@ def open_film(
 def write_flight(
     film: Film,
     scene: Scene,
-    scenes: TourScenes | None,
+    tour: TourGraph | None,
     folder: Path,
     fps: float,
     seconds: float | None,
-    at: float,
-    settings: DrawSettings,
     show_file: Callable[[Path], None],
 ) -> None:
-    """Write the film of a flight, and frames of it as stills before the film is complete.
-
-    For a scene these are `flythrough.mp4`, `view_000.png` and so on, and a panorama; for a tour `tour.mp4` and a still
-    at each panorama (`01_NAME.png`).
+    """Write the film of the way through a scene (`film.mp4`), and a still at each panorama before it (`01_NAME.png`).
 
     Args:
         film: of the scene or tour.
         scene: the scene, or the first one of the tour.
-        scenes: of the tour; None for another scene.
+        tour: None for another scene.
         folder: created if it does not exist.
         fps, seconds: see `list_flight`.
-        at: fraction of the flight at which the panorama is rendered.
-        settings: draw settings, whose mode the panorama has.
         show_file: called with each file that is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stills: dict[int, list[str]] = {}
-    if scenes is None:
-        shots = list_flight(partial(compute_flight_pose, scene), fps, FIELD_OF_VIEW, seconds)
-        for still in STILLS:
-            stills.setdefault(round(still * (len(shots) - 1)), []).append(f"view_{round(100 * still):03d}.png")
+    if tour is None and not len(scene.cam2world):
+        shots = orbit_scene(scene, fps, seconds)
+        visits, names = {k: k / _ORBIT_STILLS for k in range(_ORBIT_STILLS)}, ["view"] * _ORBIT_STILLS
     else:
-        tour, route = scenes.tour, plan_route(scenes.tour, scenes.tour.plan_walk(), rest=REST_SECONDS)
-        shots = list_flight(route, fps, FIELD_OF_VIEW, seconds)
-        for node, at in route.visits.items():
-            still = f"{node + 1:02d}_{make_file_name(tour.panoramas[node].label)}.png"
-            stills.setdefault(math.ceil(at * (len(shots) - 1)), []).append(still)
+        route = plan_visits(scene) if tour is None else plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+        shots, visits = list_flight(route, fps, FIELD_OF_VIEW, seconds), route.visits
+        names = [panorama.label for panorama in (tour or make_graph(scene)).panoramas]
+    stills: dict[int, list[str]] = {}
+    for node, at in visits.items():
+        still = f"{node + 1:02d}_{make_file_name(names[node])}.png"
+        stills.setdefault(math.ceil(at * (len(shots) - 1)), []).append(still)
 
     def show(number: int, color: np.ndarray) -> None:
         for name in stills.get(number, ()):
             write_image(folder / name, color)
             show_file(folder / name)
 
-    name = "flythrough.mp4" if scenes is None else "tour.mp4"
-    write_film(folder / name, film, shots, fps, show=show)
-    show_file(folder / name)
-    if scenes is None:
-        file = folder / f"panorama_{round(100 * at):03d}.png"
-        write_image(file, pipeline.render(scene, compute_flight_pose(scene, at), blend=settings.mode).color)
-        show_file(file)
+    write_film(folder / "film.mp4", film, shots, fps, show=show)
+    show_file(folder / "film.mp4")

@@ -1,6 +1,6 @@
 """The viewer without its window: scene, image and panels on any OpenGL context, one frame at a time.
 
-`Viewer` holds the objects of the application; `Scenes` follows the life of each scene.
+`Viewer` holds the objects of the application; `Session` has the scenes.
 Keys and panels change `state` at once, and queue all other actions, which are done at the end of the frame.
 """
 
@@ -31,15 +31,15 @@ from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.hotspots import Hotspot, find_clicked, find_hotspots
+from pansplat_viewer.core.loader import Find, SceneEntry, SceneLoader
+from pansplat_viewer.core.picking import PickedPoint, compute_pixel_ray, pick_point
+from pansplat_viewer.core.placing_by_hand import PlacingByHand
+from pansplat_viewer.core.settings import RendererChoice
+from pansplat_viewer.core.state import ViewerState, advance_path
 from pansplat_viewer.draw.frame_renderer import render_image
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.hotspots import Hotspot, find_clicked, find_hotspots
-from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader
-from pansplat_viewer.scene.picking import PickedPoint, compute_pixel_ray, pick_point
-from pansplat_viewer.scene.placing import Placing
-from pansplat_viewer.scene.settings import RendererChoice
-from pansplat_viewer.scene.state import ViewerState, advance_path
-from pansplat_viewer.scenes import Scenes
+from pansplat_viewer.session import Session
 from pansplat_viewer.ui.panels import Panels
 from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
 from pansplat_viewer.window.gui import Gui
@@ -97,7 +97,7 @@ class Viewer:
         self.error: str | None = None
         self._clock = clock
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
-        self.scenes = Scenes(
+        self.session = Session(
             self.state,
             self.stage,
             loader,
@@ -106,7 +106,7 @@ class Viewer:
             show_error=self.show_error,
             listed=self._note_listed,
         )
-        self.placing: Placing | None = None
+        self.placing: PlacingByHand | None = None
         self._placed: SceneEntry | None = None  # whose panoramas `placing` has
         self._folder = folder
         self.panels = Panels(ctx)
@@ -129,7 +129,7 @@ class Viewer:
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
         is_placing = self.placing is not None and self.placing.progress is not None
-        return self.moving or self.scenes.is_busy or self.stage.photographs.is_reading or is_placing
+        return self.moving or self.session.is_busy or self.stage.photographs.is_reading or is_placing
 
     @property
     def moving(self) -> bool:
@@ -149,14 +149,16 @@ class Viewer:
         return [names[k] if k < len(names) else str(k + 1) for k in range(len(self.state.context))]
 
     def _find_hotspots(self) -> list[Hotspot]:
-        """The places of panoramas in the image, in points of the window, which may have several pixels."""
+        """The places of panoramas in the image, in points of the window, which may have several pixels; none while the
+        camera flies."""
         camera, fade = self.state.camera, self.stage.fade
         size = imgui.get_io().display_size
         points = int(size.x), int(size.y)
-        tour, moment = self.scenes.tour, self.state.moment
-        if tour is None or fade.parts[fade.front] != tour.part or (moment is not None and moment.arrival is not None):
+        tour, moment = self.session.tour, self.state.moment
+        is_moving = moment is not None and moment.step.kind in ("flight", "zoom")
+        if tour is None or fade.parts[fade.front] != tour.part or is_moving:
             return []
-        return find_hotspots(tour, camera, points)
+        return find_hotspots(tour, camera, points, self.panels.width if self.state.overlay else 0.0)
 
     # --- frames ---
 
@@ -168,12 +170,12 @@ class Viewer:
         state, stage = self.state, self.stage
         _, _, width, height = target.viewport
         state.now, stage.size = self._clock(), (width, height)
-        self.scenes.poll()
+        self.session.poll()
         if not self.moving:
-            self.scenes.exchange()
-        if self.scenes.entry is not self._placed:
-            self._placed = self.scenes.entry
-            self.placing = Placing.open(self.placing, self._placed, self.scenes.entries)
+            self.session.exchange()
+        if self.session.entry is not self._placed:
+            self._placed = self.session.entry
+            self.placing = PlacingByHand.open(self.placing, self._placed, self.session.entries)
         if self.placing is not None:
             self.placing.update()
             self.error, self.placing.error = self.placing.error or self.error, None
@@ -186,10 +188,10 @@ class Viewer:
             events = self.placing.apply(events)
         apply_input(self, events)
         step = min(seconds, 2 * _MAX_STEP_SECONDS)
-        self.scenes.fly(step, was_playing)
+        self.session.fly(step, was_playing)
         advance_path(state, step)
-        self.scenes.update()
-        if self.scenes.loaded is None and self.scenes.tour is None:
+        self.session.update()
+        if self.session.loaded is None and self.session.tour is None:
             stage.fade_to_photograph(stage.photographs.find_nearest(np.asarray(state.camera.position)))
         stage.draw(target)
         self.gui.end(self._ctx, target)
@@ -201,7 +203,7 @@ class Viewer:
         """Stop the threads and free every GL object; the context must still be current."""
         if self.placing is not None:
             self.placing.close()
-        self.scenes.loader.close()
+        self.session.loader.close()
         self.stage.release()
         self.panels.release()
         self.gui.close()
@@ -216,7 +218,7 @@ class Viewer:
     def dismiss_error(self) -> None:
         """Close the error message, and go on with the scene that is shown."""
         self.error = None
-        self.scenes.dismiss()
+        self.session.dismiss()
 
     # --- actions of keys and panels ---
 
@@ -258,7 +260,7 @@ class Viewer:
 
         The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
         """
-        stage, state, loaded = self.stage, self.state, self.scenes.loaded
+        stage, state, loaded = self.stage, self.state, self.session.loaded
         if loaded is None or stage.photograph is not None:
             state.show_message("there is no scene of this place yet")
             return
@@ -300,17 +302,17 @@ class Viewer:
         """Write the key frames of the camera path."""
         file = Path(text).expanduser()
         with self._showing_errors():
-            if self.scenes.loaded is not None:
+            if self.session.loaded is not None:
                 require_replaceable("the camera path", [file])
-                write_path(self.state.path.map_places(self.scenes.loaded.scene.frame.globalize_places), file)
+                write_path(self.state.path.map_places(self.session.loaded.scene.frame.globalize_places), file)
                 self.state.show_message(f"wrote {text}; pansplat render SCENE --path {text} -o film.mp4 draws it")
 
     def open_path(self, text: str) -> None:
         """Read the key frames of a camera path."""
         with self._showing_errors():
-            if self.scenes.loaded is not None:
+            if self.session.loaded is not None:
                 path = read_path(Path(text).expanduser())
-                self.state.path = path.map_places(self.scenes.loaded.scene.frame.localize_places)
+                self.state.path = path.map_places(self.session.loaded.scene.frame.localize_places)
                 self.state.path_seconds, self.state.path_playing = 0.0, False
 
     @contextlib.contextmanager

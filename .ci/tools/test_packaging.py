@@ -136,7 +136,7 @@ def test_an_installed_wheel_needs_its_dependencies_only(installed: Path, tmp_pat
     )
     options = ["--offscreen", tmp_path / "out", "--size", "64x32", "--seconds", "0.1"]
     run_in(installed, sys.executable, "-c", program, ",".join(foreign), tmp_path / "scene.ply", *options)
-    with av.open(str(tmp_path / "out" / "flythrough.mp4")) as film:
+    with av.open(str(tmp_path / "out" / "film.mp4")) as film:
         assert len(list(film.decode(video=0))) > 1
 
 

@@ -30,7 +30,6 @@ from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
 from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
 
-FLIGHT_SECONDS = 4.0  # of the film of a pair
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
 
 Image = Float[np.ndarray, "height width 3"]
@@ -155,30 +154,17 @@ class Shot:
         return Shot(moment.pose, fov, seconds, moment, goal)
 
 
-def list_flight(
-    flight: Route | Callable[[float], Float[np.ndarray, "4 4"]],
-    fps: float,
-    vertical_fov_degrees: float,
-    seconds: float | None = None,
-) -> list[Shot]:
-    """The frames of a flight, two or more.
+def list_flight(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
+    """The frames of a way through panoramas, two or more.
 
     Args:
-        flight: the pose at a fraction of the flight, or the route through a tour.
+        route: the way.
         fps: frames per second.
         vertical_fov_degrees: of each frame.
-        seconds: duration, 4 by default; that of a route changes the speed of the camera and of the fades.
+        seconds: duration, by default that of the route; another one changes the speed of the camera and of the fades.
     """
-    route = flight if isinstance(flight, Route) else None
-    count = max(round((seconds or (FLIGHT_SECONDS if route is None else route.seconds)) * fps), 2)
-    shots = []
-    for number in range(count):
-        at = number / (count - 1)
-        if isinstance(flight, Route):
-            shots.append(Shot.of_moment(flight.at(at), vertical_fov_degrees, at * flight.seconds))
-        else:
-            shots.append(Shot(flight(at), vertical_fov_degrees, number / fps))
-    return shots
+    fractions = np.linspace(0, 1, max(round((seconds or route.seconds) * fps), 2)).tolist()
+    return [Shot.of_moment(route.at(at), vertical_fov_degrees, at * route.seconds) for at in fractions]
 
 
 def follow_path(path: CameraPath, fps: float, scene: Scene, tour: TourGraph | None) -> list[Shot]:

@@ -181,6 +181,11 @@ class TourGraph:
         graph = dataclasses.replace(self, overlaps={(a, b): overlap for a, b, overlap in overlaps}, walls=())
         return graph.with_walls((a, b) for a, b, overlap in overlaps if a != b and overlap == 0)
 
+    def with_all_edges(self) -> TourGraph:
+        """The graph of a scene without edges, in which cameras may fly between any two panoramas."""
+        edges = [*itertools.combinations(range(len(self)), 2)] or [(0, 0)]
+        return dataclasses.replace(self, overlaps=dict.fromkeys(edges, 1.0))
+
     def list_parts(self) -> list[ViewNumbers]:
         """The nodes of each part."""
         numbers = np.array(self.parts)

@@ -15,8 +15,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import turn_axes, wrap_angle
-from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.graph import Edge, TourGraph, make_graph
 from pansplat.tours.outlook import find_widest
 
 FADE_SECONDS = 1.0
@@ -187,6 +188,14 @@ def plan_route(
     if not planner.steps or planner.steps[-1].kind == "zoom":
         planner.add("rest", planner.camera, _END_SECONDS)
     return Route(tuple(planner.steps), tuple(walk), tour.level_axes)
+
+
+def plan_visits(scene: Scene) -> Route:
+    """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
+    tour = make_graph(scene)
+    if scene.overlaps:
+        return plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+    return plan_route(tour.with_all_edges(), range(len(tour)), rest=REST_SECONDS)
 
 
 class _Planner:

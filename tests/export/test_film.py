@@ -16,7 +16,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.rendering.image_planes import image_planes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
-from pansplat.tours.route import STOP_SECONDS
+from pansplat.tours.route import STOP_SECONDS, plan_visits
 
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 POSES[1, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right
@@ -130,8 +130,10 @@ def test_each_frame_of_a_film_shows_the_path_at_its_time(scene: Scene, tmp_path:
     assert [shot.vertical_fov_degrees for shot in shots[:: len(shots) - 1]] == [75.0, 60.0]
 
 
-def test_a_film_of_a_flight_has_at_least_two_frames() -> None:
-    poses = []
-    shots = list_flight(lambda at: poses.append(at) or np.eye(4), 24.0, 75.0, 0.01)
-    assert len(shots) == 2 and poses == [0, 1]
-    assert len(list_flight(lambda at: np.eye(4), 24.0, 75.0)) == 96
+def test_a_film_of_two_panoramas_moves_as_that_of_a_tour(scene: Scene) -> None:
+    route = plan_visits(scene)
+    kinds = [step.kind for step in route.steps]
+    assert kinds == ["rest", "flight", "rest"] and route.walk == (0, 1)
+    shots = list_flight(route, 24.0, 75.0)
+    assert len(shots) == round(24 * route.seconds) and shots[-1].moment.photograph == 1
+    assert [shot.seconds for shot in list_flight(route, 24.0, 75.0, 0.01)] == [0, route.seconds], "two frames at least"

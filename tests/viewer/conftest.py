@@ -27,12 +27,12 @@ from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
 from pansplat.tours.graph import TourGraph, merge_scenes
 from pansplat.tours.outlook import BINS
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry
+from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
-from pansplat_viewer.scene.tour import TourScenes
 
 _Y0 = 0.28209479177387814  # the constant harmonic
 

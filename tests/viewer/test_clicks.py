@@ -31,16 +31,16 @@ from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
 from pansplat.system.progress import report_progress
 from pansplat.tours.graph import find_tours
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry, SceneLoader
+from pansplat_viewer.core.picking import project_point
+from pansplat_viewer.core.settings import Display, DrawSettings
+from pansplat_viewer.core.state import ViewerState
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader
-from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.scene.settings import Display, DrawSettings
-from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.ui.minimap import describe_panorama, describe_panoramas
-from pansplat_viewer.ui.photographs import Photographs
-from pansplat_viewer.ui.placing import describe_state
+from pansplat_viewer.ui.photograph_textures import PhotographTextures
+from pansplat_viewer.ui.placing_panel import describe_state
 from pansplat_viewer.viewer import Viewer
 
 pytestmark = pytest.mark.gl
@@ -98,7 +98,7 @@ class User:
 
     def wait_for_progress(self, *expected: object) -> None:
         """Draw frames until the panel shows this progress: name, description, fraction."""
-        self.draw_until(lambda: self.viewer.scenes.loading == expected, f"progress {expected}", 0.01)
+        self.draw_until(lambda: self.viewer.session.loading == expected, f"progress {expected}", 0.01)
 
     def settle(self, *, refining: bool = False) -> None:
         """Draw frames until nothing changes without input; with `refining`, except the progress of a refinement."""
@@ -121,7 +121,7 @@ class User:
         return self.read_screen()
 
     def show(self, *entries: SceneEntry) -> None:
-        self.viewer.scenes.show(list(entries), 0)
+        self.viewer.session.show(list(entries), 0)
         self.settle()
 
     def click(self, label: str) -> None:
@@ -227,7 +227,7 @@ def session(request, gl_context, small_scene, pair, axis_photos, load_house, tmp
 def user(session, ctx) -> User:
     """The session with scene, state and camera as at the start."""
     session.load, session.find = session.first_load, lambda path, show: [SceneEntry("opened")]
-    if session.viewer.scenes.names != NAMES or session.viewer.scenes.current != 0:
+    if session.viewer.session.names != NAMES or session.viewer.session.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
     kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "message", "message_until")
@@ -281,8 +281,7 @@ CLICKS = [  # in the window of a pair, and what is then true
     ("click orbit; drag 500 400 560 400", "state.orbiting and camera.position != home.position"),
     ("click orbit; click orbit", "not state.orbiting"),
     ("drag 500 400 470 400", "camera.yaw_radians > 0 and camera.position == home.position"),
-    ("click 2##panorama", "camera.position == (0, 0, 0.5)"),
-    ("click 2##panorama; click 1##panorama", "camera.position == (0, 0, 0)"),
+    ("click 2##panorama; wait", "camera.position == (0, 0, 0.5)"),
     ("key w", "camera.position[2] > 0"),
     ("key w; key r", "camera == home"),
     ("wheel 1", "camera.vertical_fov_degrees < home.vertical_fov_degrees"),
@@ -292,7 +291,7 @@ CLICKS = [  # in the window of a pair, and what is then true
     ("key tab", "not panels.widgets.items"),
     ("key tab; key h", "changed > 0.1"),
     ("key h; key escape", "changed == 0 and not state.quit"),
-    ("open pair 20 36", "viewer.scenes.current == 1"),
+    ("open pair 20 36", "viewer.session.current == 1"),
     ("open background 60 60; point 500 880", "max(state.settings.background) > 0"),
 ]
 
@@ -320,6 +319,8 @@ def test_the_state_after_clicks_and_keys_of_imgui(user):
                 user.drag(numbers[:2], numbers[2:])
             elif kind == "point":
                 user.click_at(*numbers)
+            elif kind == "wait":
+                user.draw_frames(30, 0.1)
             elif kind == "key":
                 user.press(getattr(imgui.Key, words[0]))
             else:
@@ -355,7 +356,7 @@ def predict_forever(entry, show):
 
 @pytest.mark.parametrize("state", ["predicting", "refining", "refined", "failed"])
 def test_each_state_of_a_scene_has_its_button(user, small_scene, monkeypatch, state):
-    scenes, before = user.viewer.scenes, user.read_image()
+    scenes, before = user.viewer.session, user.read_image()
     if state == "predicting":
         user.load = predict_forever
         user.click("Reload")
@@ -369,7 +370,7 @@ def test_each_state_of_a_scene_has_its_button(user, small_scene, monkeypatch, st
     elif state in ("refining", "refined"):
         bright = replace(small_scene.gaussians, harmonics=small_scene.gaussians.harmonics + 1.0)
         go, user.load = refine(small_scene, replace(small_scene, gaussians=bright))
-        user.viewer.scenes.show([SceneEntry("kitchen")], 0)
+        user.viewer.session.show([SceneEntry("kitchen")], 0)
         user.draw_until(lambda: scenes.refinement is not None, "refinement")
         user.draw_frames(2)
         if state == "refining":
@@ -402,7 +403,7 @@ def test_typing_a_path_does_not_fly_and_enter_opens_it(user):
     assert user.state.camera == user.state.home
     user.press(imgui.Key.enter)
     user.settle()
-    assert user.viewer.scenes.names == ["opened"]
+    assert user.viewer.session.names == ["opened"]
 
 
 def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeypatch):
@@ -418,13 +419,13 @@ def test_a_recent_path_is_opened_and_so_is_one_by_the_button(user, pair, monkeyp
     user.click("Open")
     user.settle()
     user.panels.path = ""
-    assert user.viewer.scenes.names == ["kitchen 1"] and user.viewer.recent == (str(Path("kitchen").absolute()),)
+    assert user.viewer.session.names == ["kitchen 1"] and user.viewer.recent == (str(Path("kitchen").absolute()),)
     user.draw_frames(2)
     user.click("recent")
     left, _, _, bottom = user.panels.widgets.items["recent"]
     user.click_at(left + 30, bottom + 12)
     user.settle()
-    assert user.viewer.scenes.names == ["kitchen 2"]
+    assert user.viewer.session.names == ["kitchen 2"]
 
 
 @both
@@ -465,7 +466,7 @@ def test_the_range_of_a_display_is_shown_and_can_be_changed(user):
 
 
 def test_photographs_of_a_pair_that_is_read_again_are_read_again(ctx, pair, tmp_path, axis_photos):
-    photographs = Photographs(ctx)
+    photographs = PhotographTextures(ctx)
     (first, *_) = pair.context
 
     def read(panorama: Panorama) -> np.ndarray:
@@ -561,12 +562,12 @@ def test_the_photograph_is_shown_where_the_camera_stands_at_a_panorama(user):
 
 
 def test_the_first_image_of_a_large_scene_is_drawn_in_the_background(user, pair, small_scene, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.scene.slots._LARGE_SCENE", 0)
+    monkeypatch.setattr("pansplat_viewer.draw.rendered_scene._LARGE_SCENE", 0)
     before, go, draw = user.read_image(), threading.Event(), CpuRenderer._draw
     monkeypatch.setattr(CpuRenderer, "_draw", lambda *arguments: go.wait(300) and draw(*arguments))
     other = replace(small_scene, gaussians=small_scene.gaussians.select(small_scene.gaussians.views == 0))
     user.load = lambda entry, show: LoadedScene(entry, other)
-    user.viewer.scenes.show([SceneEntry("large", pair=pair)], 0)
+    user.viewer.session.show([SceneEntry("large", pair=pair)], 0)
     user.draw_until(
         lambda: user.viewer.stage.slot.scene is other and user.viewer.stage.photographs._textures, "photograph"
     )
@@ -622,7 +623,7 @@ def tour_user(user, house, small_pacing) -> User:
 def test_a_note_is_typed_shown_and_removed(tour_user, house, monkeypatch):
     user, file, center = tour_user, house.folder / "links.json", tour_user.state.camera
     aside = replace(center, yaw_radians=center.yaw_radians - 0.3, pitch_radians=0.15)  # the panels cover the middle
-    monkeypatch.setattr(user.viewer.scenes, "path", house.folder)
+    monkeypatch.setattr(user.viewer.session, "path", house.folder)
     shown = []
     for button in ("", "Put at the middle", "Remove"):
         user.state.camera = center
@@ -656,12 +657,12 @@ def fly(user: User, seconds: float = 1 / 5) -> list[float]:
 
 
 def find_node(user: User) -> int:
-    return int(np.linalg.norm(user.viewer.scenes.tour.tour.positions - user.state.camera.position, axis=1).argmin())
+    return int(np.linalg.norm(user.viewer.session.tour.tour.positions - user.state.camera.position, axis=1).argmin())
 
 
 def test_the_hotspots_and_the_floor_plan_of_a_tour_can_be_hidden(tour_user):
     user = tour_user
-    assert user.viewer.scenes.tour.tour.name == "house tour"
+    assert user.viewer.session.tour.tour.name == "house tour"
     # The hotspot is right of the panel, above the statistics and messages.
     user.state.camera = replace(user.state.camera, yaw_radians=-0.25, pitch_radians=-0.4)
 
@@ -692,7 +693,7 @@ def test_a_click_on_a_hotspot_flies_there_and_fades_to_its_scene(tour_user):
     user.click_at(*hotspot.center)
     assert user.state.playing and not user.state.points
     fly(user)
-    assert np.linalg.norm(user.state.camera.position - user.viewer.scenes.tour.tour.positions[1]) < 1e-6
+    assert np.linalg.norm(user.state.camera.position - user.viewer.session.tour.tour.positions[1]) < 1e-6
     user.click_at(*user.panels.minimap.nodes[3])
     steps = fly(user)
     assert find_node(user) == 3 and user.viewer.stage.slot.scene is not first
@@ -750,9 +751,11 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
         return Piece(Surroundings(np.full((32, 64, 3), 0.5), depth), 0.0)
 
     user.find = find
-    monkeypatch.setattr("pansplat_viewer.scene.placing.read_piece", read)
-    user.viewer.scenes.search(tmp_path)
-    user.draw_until(lambda: user.viewer.scenes.tour is not None and not user.viewer.scenes.loader.is_searching, "tour")
+    monkeypatch.setattr("pansplat_viewer.core.placing_by_hand.read_piece", read)
+    user.viewer.session.search(tmp_path)
+    user.draw_until(
+        lambda: user.viewer.session.tour is not None and not user.viewer.session.loader.is_searching, "tour"
+    )
     user.settle()
     yield user
     user.viewer.placing.stop()
@@ -760,7 +763,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
 
 @pytest.mark.filterwarnings("ignore:.*has no pose of")
 def test_a_photograph_at_an_approximate_place_is_on_the_plan_beside_its_neighbour(placing_user):
-    user, tour = placing_user, placing_user.viewer.scenes.tour.tour
+    user, tour = placing_user, placing_user.viewer.session.tour.tour
     shown = [describe_panorama(tour, node) for node in range(4)]
     assert shown == ["a", "b", "c", "d (about here)"]
     assert describe_panoramas(tour) == "3 placed, 1 about here"
@@ -800,7 +803,7 @@ def test_a_photograph_is_dragged_turned_saved_shown_in_the_tour_and_undone(placi
     assert entry["placed"] == "by hand" and entry["cam2world"][0][3] == pytest.approx(1.6, abs=0.02)
     user.draw_until(lambda: find_states(user)[3] == "sure", "loaded poses")
     user.settle()
-    tour = user.viewer.scenes.tour.tour
+    tour = user.viewer.session.tour.tour
     assert describe_panorama(tour, 3) == "d (placed by hand)" and (3, 3) not in tour.overlaps
     user.click("Undo##poses")
     assert (tmp_path / "poses.json").read_bytes() == before

@@ -35,13 +35,13 @@ from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.system.devices import say_detail
 from pansplat.system.kernels import checking_each_item, pooled_empty
+from pansplat_viewer.core.background import BackgroundWorker, Report
+from pansplat_viewer.core.camera import Pinhole
+from pansplat_viewer.core.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
 from pansplat_viewer.draw.splats import Splats, drop_not_finite, select_in_view
-from pansplat_viewer.scene.background import BackgroundWorker, Report
-from pansplat_viewer.scene.camera import Pinhole
-from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 
 if TYPE_CHECKING:
     import moderngl

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.geometry.pose import blend_weights
+from pansplat_viewer.core.camera import Pinhole, create_face_cameras, find_faces_in_view
+from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.draw.splats import SortedSplats, Splats
-from pansplat_viewer.scene.camera import Pinhole, create_face_cameras, find_faces_in_view
-from pansplat_viewer.scene.settings import DrawSettings
 
 _MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
 

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt
 
 from pansplat.errors import InputError
+from pansplat_viewer.core.camera import Pinhole
+from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.draw.frames import Frame, LayerStorage
 from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, checking_memory, set_uniforms
 from pansplat_viewer.draw.splats import SortedSplats, Splats
-from pansplat_viewer.scene.camera import Pinhole
-from pansplat_viewer.scene.settings import DrawSettings
 
 _MAX_SELECTIONS = 8
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB

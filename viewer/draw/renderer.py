@@ -19,6 +19,8 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat_viewer.core.background import BackgroundWorker
+from pansplat_viewer.core.settings import SCALAR_MAPS, DrawSettings, FrameStats
 from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.draw.frame_renderer import Pacing
 from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
@@ -26,8 +28,6 @@ from pansplat_viewer.draw.layers import LayerPainter, Target, TargetStore
 from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
 from pansplat_viewer.draw.splats import SortedSplats, Splats, sort_splats
-from pansplat_viewer.scene.background import BackgroundWorker
-from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 

@@ -19,8 +19,8 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
 from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat.system.kernels import parallel_for_slices
+from pansplat_viewer.core.camera import Pinhole
 from pansplat_viewer.draw.color_maps import color_by_label
-from pansplat_viewer.scene.camera import Pinhole
 
 # Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
 # which would cost more time than it saves.

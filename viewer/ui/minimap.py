@@ -18,8 +18,8 @@ from pansplat.system.descriptions import describe_count
 from pansplat.tours.floor import choose_camera_height, find_other_storeys
 from pansplat.tours.graph import DrawnPlace, TourGraph
 from pansplat.tours.linked_rooms import place_rooms
-from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
 
 SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1

@@ -8,7 +8,7 @@ import numpy as np
 from imgui_bundle import imgui
 
 from pansplat.geometry.path import find_direction
-from pansplat_viewer.scene.picking import project_point
+from pansplat_viewer.core.picking import project_point
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 
 if TYPE_CHECKING:

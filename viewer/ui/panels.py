@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.settings import Display
-from pansplat_viewer.scene.state import (
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.settings import Display
+from pansplat_viewer.core.state import (
     KEY_SECONDS,
     ViewerState,
     add_key_frame,
     choose_display,
     fly_to,
-    jump_to_view,
+    go_to_view,
     make_key_frame,
     show_path,
     toggle_play,
 )
-from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.minimap import Minimap, describe_panorama, describe_panoramas
 from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
@@ -39,7 +39,7 @@ from pansplat_viewer.ui.overlays import (
     draw_message,
     draw_points,
 )
-from pansplat_viewer.ui.placing import PlacingWindow, draw_photographs
+from pansplat_viewer.ui.placing_panel import PlacingWindow, draw_photographs
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 from pansplat_viewer.window.input import KEYS
 
@@ -59,13 +59,14 @@ class Panels:
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
         notes: the field and buttons of notes.
+        width: of the main panel in the last frame, pixels.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.widgets = Widgets()
         self.minimap, self.placing = Minimap(), PlacingWindow(ctx, self.widgets)
         self.notes = NotesSection(self.widgets)
-        self.path, self.path_file = "", "path.json"
+        self.path, self.path_file, self.width = "", "path.json", 0.0
 
     def draw(self, viewer: Viewer) -> None:
         """Draw the panels that are shown."""
@@ -81,11 +82,11 @@ class Panels:
             draw_hotspots(viewer.hotspots)
             draw_notes(viewer)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
-            viewer.queue(viewer.scenes.reload)
+            viewer.queue(viewer.session.reload)
         if state.help:
             state.help = _draw_help()
-        if viewer.scenes.loading:
-            self._draw_progress(viewer, *viewer.scenes.loading)
+        if viewer.session.loading:
+            self._draw_progress(viewer, *viewer.session.loading)
         elif viewer.error:
             self._draw_error(viewer, viewer.error)
         if state.message and state.now < state.message_until:
@@ -102,6 +103,7 @@ class Panels:
         imgui.set_next_window_size_constraints((0, size.y), (0.6 * size.x, size.y))
         imgui.set_next_window_bg_alpha(0.98)
         imgui.begin("pansplat", None, _PANEL)
+        self.width = imgui.get_window_width()
         imgui.push_item_width(-110 * scale)
         self._draw_sections(viewer)
         imgui.pop_item_width()
@@ -111,11 +113,11 @@ class Panels:
         """Draw what everybody needs, open, and the rest, closed."""
         section = self.widgets.section
         self._draw_scene(viewer)
-        if viewer.scenes.tour is not None:
-            section("Plan", partial(self._draw_plan, viewer, viewer.scenes.tour))
+        if viewer.session.tour is not None:
+            section("Plan", partial(self._draw_plan, viewer, viewer.session.tour))
         if viewer.state.context.size:
             section("Photographs", partial(self._draw_photographs, viewer))
-        if viewer.scenes.notes or len(viewer.stage.photographs):
+        if viewer.session.notes or len(viewer.stage.photographs):
             section("Notes", partial(self._draw_notes, viewer))
         section("Film", partial(self._draw_film, viewer))
         section("Expert", partial(self._draw_expert, viewer), opened=False)
@@ -123,7 +125,7 @@ class Panels:
     def _draw_photographs(self, viewer: Viewer) -> None:
         """Draw where the camera can go, and the states of estimated poses."""
         state, placing = viewer.state, viewer.placing
-        if state.tour is None:  # whose plan has a list
+        if not state.is_tour:  # whose plan has a list
             self._draw_panoramas(state, viewer.panoramas)
         if self.widgets.button("Stop" if state.playing else "Fly"):
             toggle_play(state)
@@ -159,8 +161,8 @@ class Panels:
             imgui.end_combo()
         else:
             self.widgets.record("visit")
-        if viewer.scenes.background is not None:
-            task, fraction = viewer.scenes.background
+        if viewer.session.background is not None:
+            task, fraction = viewer.session.background
             draw_wrapped(task)
             imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
 
@@ -168,7 +170,7 @@ class Panels:
         """Draw the note at the middle of the image, and what was not used of the folder."""
         if len(viewer.stage.photographs):
             self.notes.draw(viewer)
-        for note in viewer.scenes.notes:
+        for note in viewer.session.notes:
             draw_wrapped(note, is_disabled=True)
 
     def _draw_film(self, viewer: Viewer) -> None:
@@ -188,37 +190,37 @@ class Panels:
         self._draw_settings(viewer)
 
     def _draw_scene(self, viewer: Viewer) -> None:
-        scenes, recent, width = viewer.scenes, viewer.recent, -60 * imgui.get_style().font_scale_dpi
-        if scenes.entries:
-            names = [f"{i + 1}. {name}" for i, name in enumerate(scenes.names)]  # numbered, because names may repeat
+        session, recent, width = viewer.session, viewer.recent, -60 * imgui.get_style().font_scale_dpi
+        if session.entries:
+            names = [f"{i + 1}. {name}" for i, name in enumerate(session.names)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
-            changed, index = imgui.combo("##pair", max(scenes.current, 0), names)
+            changed, index = imgui.combo("##pair", max(session.current, 0), names)
             self.widgets.record("pair")
             if changed:
-                viewer.queue(viewer.scenes.choose, index)
+                viewer.queue(session.choose, index)
         imgui.set_next_item_width(width)
         hint, flags = "folder or scene, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
         entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
         self.widgets.record("path")
         imgui.same_line()
         if (self.widgets.button("Open") or entered) and self.path.strip():
-            viewer.queue(scenes.search, Path(self.path.strip()).expanduser())
+            viewer.queue(session.search, Path(self.path.strip()).expanduser())
         if recent:
             imgui.set_next_item_width(width)
             if imgui.begin_combo("##recent", "recent"):
                 for path in recent:
                     if imgui.selectable(path, False)[0]:
-                        viewer.queue(scenes.search, Path(path))
+                        viewer.queue(session.search, Path(path))
                 imgui.end_combo()
             self.widgets.record("recent")
             imgui.same_line()
-        if scenes.entries and self.widgets.button("Reload"):
-            viewer.queue(viewer.scenes.reload)
-        if viewer.scenes.refinement is not None:
+        if session.entries and self.widgets.button("Reload"):
+            viewer.queue(session.reload)
+        if (fraction := session.refinement) is not None:
             if self.widgets.button("Cancel"):
-                viewer.queue(viewer.scenes.cancel_refinement)
+                viewer.queue(session.cancel_refinement)
             imgui.same_line()
-            imgui.progress_bar(viewer.scenes.refinement, (-1, 0), f"refining {100 * viewer.scenes.refinement:.0f}%")
+            imgui.progress_bar(fraction, (-1, 0), f"refining {100 * fraction:.0f}%")
 
     def _draw_gaussians(self, state: ViewerState) -> None:
         settings, num_views = state.settings, state.num_views
@@ -271,7 +273,7 @@ class Panels:
             if view and imgui.get_item_rect_max().x + width < right - style.window_padding.x:
                 imgui.same_line()
             if imgui.button(f"{name}##panorama {view}"):
-                jump_to_view(state, view)
+                go_to_view(state, view)
             self.widgets.record(f"{view + 1}##panorama")
 
     def _draw_display(self, state: ViewerState) -> None:
@@ -292,7 +294,7 @@ class Panels:
         imgui.set_next_window_pos((size.x / 2, size.y - 6 * MARGIN * scale), 0, (0.5, 1.0))
         imgui.set_next_window_size((min(620 * scale, size.x - 2 * MARGIN), 0))
         imgui.begin("##progress", None, FIXED | imgui.WindowFlags_.no_title_bar.value)
-        text = ", ".join(filter(None, (f"{name}: {task}", viewer.scenes.loader.describe_time())))
+        text = ", ".join(filter(None, (f"{name}: {task}", viewer.session.loader.describe_time())))
         at = fraction or -viewer.state.now  # a bar that moves, while nothing is done
         imgui.push_style_color(imgui.Col_.plot_histogram.value, _BAR_COLOR)
         imgui.progress_bar(at, (-80 * scale, 0), "")
@@ -302,7 +304,7 @@ class Panels:
         imgui.get_window_draw_list().add_text(place, white, text)
         imgui.same_line()
         if self.widgets.button("Cancel##loading"):
-            viewer.queue(viewer.scenes.cancel_loading)
+            viewer.queue(viewer.session.cancel_loading)
         imgui.end()
 
     def _draw_screenshot(self, viewer: Viewer) -> None:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pansplat.constants import FAST, WALK_SPEED
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, limit_camera, toggle_play
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.state import ViewerState, add_key_frame, go_home, go_to_view, limit_camera, toggle_play
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
@@ -91,7 +91,7 @@ def _jump_by(state: ViewerState, steps: int) -> None:
     """Go from the nearest panorama to another one, in the order of the list."""
     if len(state.context):
         distances = np.linalg.norm(state.context[:, :3, 3] - state.camera.position, axis=1)
-        jump_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
+        go_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
 
 
 def _escape(viewer: Viewer, _: Input) -> None:
@@ -111,15 +111,13 @@ KEYS = (
     KeyRow("scroll", "field of view (orbit: distance)"),
     KeyRow("V", "orbit or fly", {"v": _toggle("orbiting")}),
     KeyRow("F", "focus the point in the centre", {"f": _queue("focus_center")}),
-    KeyRow(
-        "1 2 ... 9", "jump to a panorama (tour: fly there)", {str(n + 1): _change(jump_to_view, n) for n in range(9)}
-    ),
+    KeyRow("1 2 ... 9", "go to a panorama", {str(n + 1): _change(go_to_view, n) for n in range(9)}),
     KeyRow(
         "PgDn, PgUp",
         "the next or previous panorama",
         {"page down": _change(_jump_by, 1), "page up": _change(_jump_by, -1)},
     ),
-    KeyRow("Space", "play the flight between them", {"space": _change(toggle_play)}),
+    KeyRow("Space", "play the way through them", {"space": _change(toggle_play)}),
     KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),

@@ -195,7 +195,7 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         if not moving and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
             active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to process it
         if window.dropped:
-            viewer.scenes.search(window.dropped[-1])
+            viewer.session.search(window.dropped[-1])
             window.dropped.clear()
         now = time.perf_counter()
         seconds, last = now - last, now
@@ -211,6 +211,6 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         if not shown:
             window.show()
             shown, active_until = True, time.perf_counter() + 0.25
-        scenes = viewer.scenes
-        if scenes.current >= 0 and title != (title := f"{scenes.names[scenes.current]} - pansplat"):
+        session = viewer.session
+        if session.current >= 0 and title != (title := f"{session.names[session.current]} - pansplat"):
             window.set_title(title)

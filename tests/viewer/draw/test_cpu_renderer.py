@@ -9,8 +9,8 @@ import torch
 from refusals import expect_error
 
 from pansplat.rendering.cpu.display import MIN_TRANSMITTANCE
+from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer, choose_renderer, create_renderer
-from pansplat_viewer.scene.settings import DrawSettings
 
 pytestmark = pytest.mark.gl
 

@@ -11,9 +11,9 @@ from PIL import Image
 
 from pansplat.images.image_files import write_image
 from pansplat.rendering import rasterize
+from pansplat_viewer.core.settings import SCALAR_MAPS, Display, DrawSettings, Mode
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import render_image
-from pansplat_viewer.scene.settings import SCALAR_MAPS, Display, DrawSettings, Mode
 
 pytestmark = pytest.mark.gl
 

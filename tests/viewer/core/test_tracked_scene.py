@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from pansplat_viewer.scene.life import SceneLife
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry
+from pansplat_viewer.core.tracked_scene import TrackedScene
 
 ENTRY = SceneEntry("kitchen")
 
@@ -34,12 +34,12 @@ def test_the_state_after_events(small_scene, events, state, near):
         "show": LoadedScene(ENTRY, small_scene, is_final=False),
         "final": LoadedScene(ENTRY, replace(small_scene, near=0.5)),
     }
-    life = SceneLife(ENTRY)
+    tracked = TrackedScene(ENTRY)
     for event in events.split():
         if event in scenes:
-            life.receive(scenes[event])
+            tracked.receive(scenes[event])
         else:
-            getattr(life, event)()
-    assert life.state == state
-    assert (None if life.loaded is None else life.loaded.scene.near) == near
-    assert life.is_known == (state in ("predicted", "refining", "refined"))
+            getattr(tracked, event)()
+    assert tracked.state == state
+    assert (None if tracked.loaded is None else tracked.loaded.scene.near) == near
+    assert tracked.is_known == (state in ("predicted", "refining", "refined"))

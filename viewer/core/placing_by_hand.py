@@ -19,8 +19,8 @@ from pansplat.geometry.path import wrap_angle
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import Piece, PlanFrame, PlanPose, find_wall_yaw, read_piece
-from pansplat_viewer.scene.background import BackgroundWorker, Report
-from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
+from pansplat_viewer.core.background import BackgroundWorker, Report
+from pansplat_viewer.core.loader import SceneEntry, list_panoramas
 
 if TYPE_CHECKING:
     from pansplat_viewer.window.input import Input
@@ -32,7 +32,7 @@ _PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # metres, around what a plan shows, and 
 Nodes = tuple[int, ...]
 
 
-class Placing:
+class PlacingByHand:
     """The panoramas of a folder, and the one that is being placed.
 
     Attributes:
@@ -75,7 +75,9 @@ class Placing:
         self.error: str | None = None
 
     @staticmethod
-    def open(before: Placing | None, entry: SceneEntry | None, entries: Sequence[SceneEntry]) -> Placing | None:
+    def open(
+        before: PlacingByHand | None, entry: SceneEntry | None, entries: Sequence[SceneEntry]
+    ) -> PlacingByHand | None:
         """The panoramas of the folder of an entry, those of `before` if they are the same; None without any.
 
         Args:
@@ -89,7 +91,7 @@ class Placing:
                 return before
             before.close()
         panoramas = [] if source is None else list_panoramas(entries, source.folder)
-        return Placing(source.folder, panoramas) if source is not None and panoramas else None
+        return PlacingByHand(source.folder, panoramas) if source is not None and panoramas else None
 
     def reopen(self, entries: Sequence[SceneEntry]) -> bool:
         """Take the poses of panoramas that were loaded again; returns False if they are others, or had no poses before.

@@ -1,4 +1,4 @@
-"""The life of a scene in the viewer, from its photographs to its refinement. Needs no window.
+"""How far a scene of the viewer is, from its photographs to its refinement. Needs no window.
 
     photograph --request--> predicting --receive--> refining --receive--> refined
         ^                     |    |                 |    ^
@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry
 
 State = Literal["photograph", "predicting", "predicted", "refining", "refined", "failed"]
 
 
-class SceneLife:
+class TrackedScene:
     """One scene, and how far it is.
 
     Attributes:

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from pansplat.geometry.path import wrap_angle
 from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
-from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.picking import project_point
+from pansplat_viewer.core.tour_scenes import TourScenes
 
-_MIN_PIXELS = 14.0  # of the radius within which a click is meant
+_MIN_PIXELS = 14.0  # least radius within which a click is meant
+_BORDER, _STEP = 40.0, 56.0  # pixels: from the middle of an arrow to the border, and to the next arrow
+_ARROW = np.array(((-8.0, -12.0), (12.0, 0.0), (-8.0, 12.0)))  # corners of an arrow to the right, pixels
 
 
 @dataclass(frozen=True)
 class Hotspot:
-    """The place of a panorama in the image, on the floor below its camera, or where a link leads to it.
+    """The place of a panorama in the image, on the floor below its camera, or where a link leads to it; or an arrow at
+    the border to a place outside.
 
     Attributes:
         node: number of the panorama.
         label: its name, or the text of the link.
         center: pixels, from the left and from the top.
         radius: pixels, within which a click is meant.
-        ring: corners of the circle on the floor, or upright on a wall, pixels.
+        ring: corners of the circle on the floor, or upright on a wall, or of the arrow, pixels.
         is_fade: whether the panorama is in another part, to which the image fades.
+        is_arrow: whether it is an arrow.
     """
 
     node: int
@@ -35,11 +41,20 @@ class Hotspot:
     radius: float
     ring: tuple[tuple[float, float], ...]
     is_fade: bool = False
+    is_arrow: bool = False
 
 
-def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> list[Hotspot]:
-    """The panoramas that the nearest one leads to, by its edges and its own links, and that are in the image; the
-    nearest last. Those that surfaces hide are where the links lead; without links, the nearest one stays."""
+def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int], left: float = 0.0) -> list[Hotspot]:
+    """The panoramas that the nearest one leads to, by its edges and its own links; the nearest in the image last.
+
+    Those that surfaces hide are where the links lead; without links, the nearest one stays.
+
+    Args:
+        scenes: of the tour.
+        camera: of the image.
+        size: width and height of the image, pixels.
+        left: width of what covers the image from the left, pixels.
+    """
     tour, position = scenes.tour, np.asarray(camera.position)
     here = scenes.find_nearest(position)
     below = scenes.camera_height * np.asarray(camera.level)[:, 1]
@@ -57,13 +72,16 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int]) -> 
             ring = find_link_ring(tour, here, node, scenes.camera_height, scenes.outlooks.get(here))
             if ring is not None:
                 feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
-    found = []
-    for node, (foot, label) in feet.items():
+    found: list[Hotspot] = []
+    arrows: list[Hotspot] = []
+    for node, (foot, label) in sorted(feet.items(), key=lambda item: -np.linalg.norm(item[1][0] - position)):
         is_fade, is_upright = tour.is_fade(scenes.edge[0], node), bool((foot - position - below) @ below < -1e-6)
         hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=is_fade, is_upright=is_upright)
-        if hotspot is not None:
-            found.append((float(np.linalg.norm(foot - position)), hotspot))
-    return [hotspot for _, hotspot in sorted(found, key=lambda item: -item[0])]
+        if hotspot is not None and hotspot.center[0] >= left:
+            found.append(hotspot)
+        else:
+            arrows.append(_make_arrow(camera, size, left, node, label, foot, is_fade, arrows))
+    return arrows + found
 
 
 def _make_hotspot(
@@ -88,6 +106,35 @@ def _make_hotspot(
         return None
     radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_PIXELS)
     return Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
+
+
+def _make_arrow(
+    camera: Camera,
+    size: tuple[int, int],
+    left: float,
+    node: int,
+    label: str,
+    foot: Float[np.ndarray, "3"],
+    is_fade: bool,
+    others: Sequence[Hotspot],
+) -> Hotspot:
+    """The arrow to which the camera turns to see a place, beside `others`: at the side, or at the lower border."""
+    (width, height), focal = size, camera.find_focal(size[1])
+    right, _, forward = np.asarray(camera.level).T @ (foot - camera.position)
+    around = wrap_angle(math.atan2(right, forward) - camera.yaw_radians)
+    across = 0.5 * width + focal * math.tan(min(max(around, -1.5), 1.5))
+    if left <= across < width:
+        center = np.array((min(max(across, left + _BORDER), width - _BORDER), height - _BORDER))
+        turn, step = np.array(((0, -1), (1, 0))), np.array((_STEP, 0))
+    else:
+        sign = 1.0 if around > 0 else -1.0
+        center = np.array((width - _BORDER if around > 0 else left + _BORDER, 0.5 * height))
+        turn, step = np.diag((sign, 1.0)), np.array((0, _STEP))
+    while any(np.linalg.norm(center - other.center) < 0.9 * _STEP for other in others):
+        center = center + step
+    x, y = center.tolist()
+    ring = tuple(map(tuple, (center + _ARROW @ turn.T).tolist()))
+    return Hotspot(node, label, (x, y), _MIN_PIXELS, ring, is_fade, is_arrow=True)
 
 
 def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:

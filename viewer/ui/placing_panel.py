@@ -1,6 +1,6 @@
 """The list of panoramas with the states of their poses, and the window in which one is placed by hand.
 
-All that they change is in `pansplat_viewer.scene.placing`.
+All that they change is in `pansplat_viewer.core.placing_by_hand`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from pansplat.inputs.placements import Placement
 from pansplat.poses.placing import Piece
-from pansplat_viewer.scene.placing import Placing, PlanPose, PlanView
+from pansplat_viewer.core.placing_by_hand import PlacingByHand, PlanPose, PlanView
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def describe_state(placement: Placement) -> str:
     return "nowhere" if placement.about is None else "about here"
 
 
-def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None:
+def draw_photographs(viewer: Viewer, placing: PlacingByHand, widgets: Widgets) -> None:
     """Draw the list of panoramas with the states of their poses, and the buttons that change them."""
     column = _BUTTONS * imgui.get_style().font_scale_dpi
     for node, panorama in enumerate(placing.panoramas):
@@ -63,7 +63,7 @@ def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None
     if placing.problem is not None:
         draw_wrapped(placing.problem, is_disabled=True)
     if placing.can_undo and widgets.button("Undo##poses") and placing.undo():
-        viewer.queue(viewer.scenes.reload)
+        viewer.queue(viewer.session.reload)
 
 
 class PlacingWindow:
@@ -89,7 +89,7 @@ class PlacingWindow:
             self._texture.release()
         self._texture = self._shown = None
 
-    def draw(self, placing: Placing) -> bool:
+    def draw(self, placing: PlacingByHand) -> bool:
         """Draw the window; returns whether poses were changed, so that the scenes are to be loaded again."""
         assert placing.node is not None
         scale, display = imgui.get_style().font_scale_dpi, imgui.get_io().display_size
@@ -113,7 +113,7 @@ class PlacingWindow:
             placing.stop()
         return is_changed
 
-    def _draw_choice(self, placing: Placing, node: int) -> None:
+    def _draw_choice(self, placing: PlacingByHand, node: int) -> None:
         """Draw what is placed, and beside which group if there are several."""
         names, options = [panorama.label for panorama in placing.panoramas], placing.list_targets(node)
         imgui.align_text_to_frame_padding()
@@ -147,7 +147,7 @@ class PlacingWindow:
         middle = at.x + width / 2
         imgui.get_window_draw_list().add_line((middle, at.y), (middle, at.y + height), _color(_PIECE), 1.0)
 
-    def _draw_plan(self, placing: Placing, scale: float) -> None:
+    def _draw_plan(self, placing: PlacingByHand, scale: float) -> None:
         """Draw the plan, and apply the pointer and the wheel to the panorama."""
         available, at = imgui.get_content_region_avail(), imgui.get_cursor_screen_pos()
         size = (max(available.x, 50.0), max(available.y - 56 * scale, 50.0))
@@ -206,7 +206,7 @@ class PlacingWindow:
         ((x, y),) = self._to_screen(np.array([place[:2]]))
         return x + _KNOB * scale * math.sin(place.yaw), y - _KNOB * scale * math.cos(place.yaw)
 
-    def _handle(self, placing: Placing, scale: float) -> None:
+    def _handle(self, placing: PlacingByHand, scale: float) -> None:
         io, mouse = imgui.get_io(), imgui.get_mouse_pos()
         if placing.place is None or not imgui.is_item_active():
             self._held = None

@@ -1,14 +1,13 @@
 """The point of a scene under the pointer, and its distance."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
-from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.settings import DrawSettings
 
 _SIZE, _FOV_DEGREES = 3, 0.3  # side of the image around a ray, pixels, and its field of view
 
@@ -25,8 +24,7 @@ def compute_pixel_ray(
     camera: Camera, pixel: tuple[float, float], size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Return origin and unit direction, in the world, of the ray through a pixel (from the left, from the top)."""
-    width, height = size
-    focal = 0.5 * height / math.tan(math.radians(camera.vertical_fov_degrees) / 2)
+    (width, height), focal = size, camera.find_focal(size[1])
     ray = np.array(((pixel[0] - 0.5 * width) / focal, (pixel[1] - 0.5 * height) / focal, 1.0))
     direction = camera.rotation @ ray
     return np.asarray(camera.position), direction / np.linalg.norm(direction)
@@ -36,8 +34,7 @@ def project_point(
     camera: Camera, point: tuple[float, float, float], size: tuple[int, int]
 ) -> tuple[float, float] | None:
     """Return the pixel (from the left, from the top) of a world point; None if it is not ahead of the camera."""
-    width, height = size
-    focal = 0.5 * height / math.tan(math.radians(camera.vertical_fov_degrees) / 2)
+    (width, height), focal = size, camera.find_focal(size[1])
     x, y, z = camera.rotation.T @ (np.asarray(point) - np.asarray(camera.position))
     if z <= 0:
         return None

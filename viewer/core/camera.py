@@ -53,6 +53,10 @@ class Camera:
         """The orbit centre, metres."""
         return np.asarray(self.position) + self.distance * self.rotation[:, 2]
 
+    def find_focal(self, height: int) -> float:
+        """The focal length of an image with this height, pixels."""
+        return 0.5 * height / math.tan(math.radians(self.vertical_fov_degrees) / 2)
+
 
 def move_to_pose(camera: Camera, cam2world: Float[np.ndarray, "4 4"]) -> Camera:
     """Move the camera to the position and viewing direction of a pose; the roll of the pose is dropped."""
@@ -76,7 +80,7 @@ def turn(camera: Camera, yaw_radians: float, pitch_radians: float) -> Camera:
 
 def turn_by_drag(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
     """Turn so that the scene follows a pointer that moved by `pixels` (right, down); `height` is the window's."""
-    radians_per_pixel = 2 * math.tan(math.radians(camera.vertical_fov_degrees) / 2) / max(height, 1)
+    radians_per_pixel = 1 / camera.find_focal(max(height, 1))
     return turn(camera, -pixels[0] * radians_per_pixel, pixels[1] * radians_per_pixel)
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.state import ViewerState, enter_scene, jump_to_view, toggle_play
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.state import ViewerState, enter_scene, go_to_view, toggle_play
 
 # Right, down, forward of the level camera are x, -z, y: a world with z up.
 Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -85,7 +85,7 @@ def test_focus_looks_at_the_point_and_orbits_it():
 def test_a_scene_is_entered_in_the_direction_of_its_start_view(small_scene):
     pose = small_scene.cam2world[:1].clone()
     pose[0, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right
-    state, single = ViewerState(), replace(small_scene, cam2world=pose, starts=((0.5, 0.2),))
+    state, single = ViewerState(), replace(small_scene, cam2world=pose, names=("a",), starts=((0.5, 0.2),))
     enter_scene(state, single)
     ahead = np.array((math.cos(0.5) * math.cos(0.2), math.sin(0.2), -math.sin(0.5) * math.cos(0.2)))
     assert np.allclose(state.camera.rotation[:, 2], ahead) and state.home == state.camera
@@ -109,5 +109,5 @@ def test_a_scene_without_cameras_is_seen_from_outside_and_has_no_flight(small_sc
     ahead = (means - np.asarray(state.camera.position)) @ state.camera.rotation[:, 2]
     assert (ahead > 0).mean() > 0.95
     toggle_play(state)
-    jump_to_view(state, 0)
+    go_to_view(state, 0)
     assert not state.playing

@@ -21,7 +21,7 @@ _MAX_TEXTURES = 4  # 25 MB each
 _VIEW_HEIGHT = 64  # pixels, of a panorama in which a view is chosen
 
 
-class Photographs:
+class PhotographTextures:
     """Posed panoramas, and the textures of those that were shown last."""
 
     def __init__(self, ctx: moderngl.Context) -> None:

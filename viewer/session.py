@@ -1,6 +1,6 @@
 """The scenes of the window: those to choose from, which one is shown, which one comes next, and those of a tour.
 
-`Scenes` follows the loader: each scene has a `SceneLife`. The stage draws them.
+`Session` follows the loader: each scene has a `TrackedScene`. The stage draws them.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.graph import list_starts
-from pansplat.tours.route import plan_route
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.life import SceneLife
-from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
-from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour, limit_camera
-from pansplat_viewer.scene.tour import TourScenes
-from pansplat_viewer.ui.photographs import find_open_view
+from pansplat.tours.route import REST_SECONDS, Route
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
+from pansplat_viewer.core.state import ViewerState, advance_flight, enter_scene, limit_camera
+from pansplat_viewer.core.tour_scenes import TourScenes, plan_way
+from pansplat_viewer.core.tracked_scene import TrackedScene
+from pansplat_viewer.ui.photograph_textures import find_open_view
 from pansplat_viewer.ui.stage import Stage
 
 
-class Scenes:
+class Session:
     """Shows what the loader finds, predicts and refines.
 
     Attributes:
@@ -71,8 +71,8 @@ class Scenes:
         self.path: Path | None = None
         self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
         self._kept: tuple[list[SceneEntry], int, Path | None] | None = None  # of the scene that is shown
-        self.shown: SceneLife | None = None
-        self.coming: SceneLife | None = None
+        self.shown: TrackedScene | None = None
+        self.coming: TrackedScene | None = None
         self.tour: TourScenes | None = None
 
     # --- what the panels read ---
@@ -169,7 +169,7 @@ class Scenes:
             self._preview(entries[index])
         else:
             self.shown.cancel()
-        self.coming = SceneLife(entries[index])
+        self.coming = TrackedScene(entries[index])
         self.coming.request()
         self.loader.request(entries[index])
 
@@ -261,7 +261,7 @@ class Scenes:
             shown.receive(result)
             return
         if coming is None or coming.state != "predicting":
-            coming = self.coming = SceneLife(result.entry)
+            coming = self.coming = TrackedScene(result.entry)
             coming.request()
         coming.receive(result)
         if self._stage.preparer.is_ready(result.scene):
@@ -276,41 +276,45 @@ class Scenes:
         elif self.shown is not None and self.shown.entry is requested:
             self.shown.cancel()
 
-    def _replace(self, life: SceneLife, loaded: LoadedScene) -> None:
+    def _replace(self, tracked: TrackedScene, loaded: LoadedScene) -> None:
         """Show a scene; if it does not fit into memory, keep the one before."""
         self.coming = None
         if self._stage.upload(self._stage.slots[0], loaded.scene, loaded.entry.name):
             self._stage.has_failed = False
-            self._enter(life, loaded)
+            self._enter(tracked, loaded)
         else:
-            life.fail()
+            tracked.fail()
 
     def exchange(self) -> None:
         """Show the refined scene in place of its prediction, while the camera stands still."""
-        stage, life, loaded = self._stage, self.shown, self.loaded
-        if life is None or loaded is None or life.state != "refined" or self._waiting is not None:
+        stage, tracked, loaded = self._stage, self.shown, self.loaded
+        if tracked is None or loaded is None or tracked.state != "refined" or self._waiting is not None:
             return
         if loaded.scene is stage.slot.scene or not stage.preparer.is_ready(loaded.scene):
             return
         if not stage.upload(stage.slot, loaded.scene, loaded.entry.name):
-            life.fail()
+            tracked.fail()
 
-    def _enter(self, life: SceneLife, loaded: LoadedScene) -> None:
+    def _enter(self, tracked: TrackedScene, loaded: LoadedScene) -> None:
         """Show a scene that is uploaded, and go to its start."""
         stage, state, entry = self._stage, self._state, loaded.entry
         photograph = stage.photograph if self.shown is None else None
         remaining = self._list_remaining() if self.shown is None else ()
-        self.shown, self.tour = life, None
+        self.shown, self.tour = tracked, None
         self._kept = self.entries, self.current, self.path
         stage.clear()
         stage.photographs.open(entry.panoramas)
         state.show_message(f"{entry.name}   (H shows the keys)")
+        enter_scene(state, loaded.scene, entry.tour, entry.start, at=self._at)
         if entry.tour is None:
-            enter_scene(state, loaded.scene, at=self._at)
-            state.bounds = None if loaded.facts is None else loaded.facts.bounds
+            state.graph = None if loaded.facts is None else loaded.facts.bounds
             limit_camera(state, state.home)
         else:
-            self._enter_tour(loaded, remaining)
+            stage.add_slot()
+            self.tour = TourScenes.start(loaded)
+            self.tour.move(np.asarray(state.camera.position))
+        if remaining:  # a way over the photographs goes on
+            state.route, state.playing = self._plan_way(remaining, REST_SECONDS), True
         tour, part = self.tour, 0 if self.tour is None else self.tour.part
         stage.scene_views = entry.views
         is_here = tour is None or tour.is_inside(np.asarray(state.camera.position), entry.views)
@@ -325,19 +329,16 @@ class Scenes:
         photographs, view = self._stage.photographs, self._find_view()
         photographs.open(entry.panoramas)
         self._stage.clear()
-        self.tour = None
         source = entry.tour or entry.pair
         if source is None:
+            self.tour = None
             return
         panoramas = entry.panoramas if entry.pair is None else entry.pair.context
         poses = torch.stack([panorama.cam2world for panorama in panoramas])
         starts, frame = list_starts(panoramas), panoramas[0].frame
         scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=starts, frame=frame)
-        if entry.tour is None:
-            enter_scene(self._state, scene, at=self._at)
-        else:
-            enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
-            self.tour = TourScenes(entry.tour)
+        enter_scene(self._state, scene, entry.tour, at=self._at)
+        self.tour = None if entry.tour is None else TourScenes(entry.tour)
         self._keep_view(view, entry.panoramas)
         nearest = photographs.find_nearest(np.asarray(self._state.camera.position))
         if nearest is not None:
@@ -375,19 +376,8 @@ class Scenes:
 
     # --- tours ---
 
-    def _enter_tour(self, loaded: LoadedScene, remaining: tuple[int, ...]) -> None:
-        """Enter a tour; a flight over its photographs goes on through the remaining panoramas."""
-        tour, state = loaded.entry.tour, self._state
-        assert tour is not None
-        self._stage.add_slot()
-        self.tour = TourScenes.start(loaded)
-        enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
-        self.tour.move(np.asarray(state.camera.position))
-        if remaining:
-            state.route, state.playing = self.tour.plan_route(state.camera.cam2world, remaining), True
-
     def _list_remaining(self) -> tuple[int, ...]:
-        """The panoramas that a flight through a tour still visits; none if there is no flight."""
+        """The panoramas that a route still visits; none if the camera follows none."""
         route, state = self._state.route, self._state
         return route.list_remaining(state.flight) if route is not None and state.playing else ()
 
@@ -398,7 +388,7 @@ class Scenes:
             return
         route = state.route if state.playing else None
         tour.move(np.asarray(state.camera.position), None if state.moment is None else state.moment.step.edge)
-        state.tour = tour.tour  # poor edges and walls are found later
+        state.graph = tour.tour  # poor edges and walls are found later
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)
         if self._loads_for_tour:
@@ -424,22 +414,27 @@ class Scenes:
             stage.fade_to_photograph(tour.find_nearest(position), tour.part)
 
     def fly(self, seconds: float, was_playing: bool) -> None:
-        """Advance the flight; in a tour from wherever the camera is."""
-        state, tour = self._state, self.tour
-        if tour is not None and state.route is not None:
-            pose = state.camera.cam2world
-            if state.target is not None:
-                state.route, state.flight, state.playing = tour.plan_way(pose, state.target), 0.0, True
-            elif state.playing and not was_playing:
-                if state.flight == 0:
-                    state.route = tour.plan_route(pose)
-                elif not np.allclose(pose, state.route.pose(state.flight), atol=1e-4):
-                    state.route = tour.plan_route(pose, state.route.list_remaining(state.flight))
-                    state.flight = 0.0
-            state.target = None
-            if state.playing:  # photographs are read before they are shown
-                for node in state.route.list_remaining(state.flight)[:2]:
-                    self._stage.get_photograph(node)
-                if state.moment is not None and state.moment.arrival is not None and self._stage.photographs.is_reading:
-                    return
-        advance_flight(state, seconds)
+        """Follow the route, from wherever the camera is."""
+        state, route = self._state, self._state.route
+        if route is None:
+            return
+        if state.target is not None:
+            state.route, state.flight, state.playing = self._plan_way((state.target,)), 0.0, True
+        elif state.playing and not was_playing:
+            if state.flight == 0:
+                state.route = self._plan_way((), REST_SECONDS)
+            elif not np.allclose(state.camera.cam2world, route.pose(state.flight), atol=1e-4):
+                state.route, state.flight = self._plan_way(route.list_remaining(state.flight), REST_SECONDS), 0.0
+        state.target = None
+        for node in self._list_remaining()[:2]:  # photographs are read before they are shown
+            self._stage.get_photograph(node)
+        if not (state.is_zooming and self._stage.photographs.is_reading):
+            advance_flight(state, seconds)
+
+    def _plan_way(self, nodes: Sequence[int], rest: float = 0.0) -> Route:
+        """A route from the camera through panoramas; see `plan_way`."""
+        graph, pose = self._state.graph, self._state.camera.cam2world
+        if self.tour is not None:
+            return self.tour.plan_way(pose, nodes, rest=rest)
+        assert graph is not None
+        return plan_way(graph, pose, nodes, rest=rest)

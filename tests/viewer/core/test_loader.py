@@ -1,4 +1,4 @@
-"""Scenes at a path are found, and loaded in a worker thread."""
+"""Session at a path are found, and loaded in a worker thread."""
 
 import threading
 import time
@@ -19,10 +19,10 @@ from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
 from pansplat.tours.graph import select_views
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
-from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.state import fit_settings
-from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
+from pansplat_viewer.core.settings import DrawSettings
+from pansplat_viewer.core.state import fit_settings
+from pansplat_viewer.core.tour_scenes import TourScenes
 
 
 def list_loader_threads() -> list[threading.Thread]:

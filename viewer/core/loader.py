@@ -16,7 +16,7 @@ from pansplat.errors import InputError, InputWarning, NothingFoundError, collect
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
 from pansplat.system.progress import CONNECTED, report_progress, stage
-from pansplat_viewer.scene.background import BackgroundWorker
+from pansplat_viewer.core.background import BackgroundWorker
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from pansplat.rendering import rasterize
-from pansplat_viewer.scene.camera import Camera, turn
-from pansplat_viewer.scene.picking import compute_pixel_ray, pick_point, project_point
-from pansplat_viewer.scene.settings import DrawSettings
+from pansplat_viewer.core.camera import Camera, turn
+from pansplat_viewer.core.picking import compute_pixel_ray, pick_point, project_point
+from pansplat_viewer.core.settings import DrawSettings
 
 SIZE = (80, 60)
 CAMERA = replace(turn(Camera(), 0.4, 0.2), position=(0.3, -0.2, 0.1), vertical_fov_degrees=70.0)
