@@ -141,13 +141,6 @@ class Viewer:
         """The image that is drawn in the background, if the window changes only when it is finished."""
         return None if self.stage.is_animated(self._clock()) else self.stage.pending
 
-    @property
-    def panoramas(self) -> list[str]:
-        """The names of the input cameras of the scene, or their numbers."""
-        scene = self.stage.slot.scene
-        names = scene.names if scene is not None else ()
-        return [names[k] if k < len(names) else str(k + 1) for k in range(len(self.state.context))]
-
     def _find_hotspots(self) -> list[Hotspot]:
         """The places of panoramas in the image, in points of the window, which may have several pixels; none while the
         camera flies."""
@@ -231,7 +224,7 @@ class Viewer:
     def click(self, place: tuple[float, float]) -> None:
         """Fly to the panorama of the hotspot at a place, or show the point there; fractions of width and height."""
         state = self.state
-        if state.hotspots and state.overlay:
+        if state.plan and state.overlay:
             points = imgui.get_io().display_size
             state.target = find_clicked(self.hotspots, (place[0] * points.x, place[1] * points.y))
         if state.target is None:

@@ -398,26 +398,30 @@ class PlanView:
         middle: of the rectangle, metres (right, forward).
         pixels_per_metre: scale.
         size: of the rectangle, pixels.
+        corner: of the rectangle on the screen, pixels.
     """
 
     middle: tuple[float, float]
     pixels_per_metre: float
     size: tuple[float, float]
+    corner: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
-    def of_points(points: Float[np.ndarray, "n 2"], size: tuple[float, float]) -> PlanView:
+    def of_points(
+        points: Float[np.ndarray, "n 2"], size: tuple[float, float], corner: tuple[float, float] = (0.0, 0.0)
+    ) -> PlanView:
         """The view of points with a margin, at least 4 m wide."""
         low, high = points.min(axis=0), points.max(axis=0)
         extent = np.maximum(high - low + 2 * _PLAN_MARGIN, _LEAST_EXTENT)
         right, forward = ((low + high) / 2).tolist()
-        return PlanView((right, forward), float(np.min(np.array(size) / extent)), size)
+        return PlanView((right, forward), float(np.min(np.array(size) / extent)), size, corner)
 
     def to_pixels(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels (right, down) from the rectangle's corner."""
+        """Pixels (right, down) of places on the screen."""
         scale = self.pixels_per_metre
-        return (np.asarray(places) - self.middle) * (scale, -scale) + np.array(self.size) / 2
+        return (np.asarray(places) - self.middle) * (scale, -scale) + np.array(self.size) / 2 + self.corner
 
     def contains(self, points: Float[np.ndarray, "n 2"]) -> bool:
         """Whether points are inside."""
-        pixels = self.to_pixels(points)
+        pixels = self.to_pixels(points) - self.corner
         return bool(((pixels >= 0) & (pixels <= self.size)).all())

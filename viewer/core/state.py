@@ -32,7 +32,7 @@ class ViewerState:
     Attributes:
         overlay, help: whether panels and key help are shown.
         context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
-        minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
+        plan: whether the floor plan of a tour, the rings of its panoramas and notes are shown.
     """
 
     camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
@@ -52,8 +52,7 @@ class ViewerState:
     route: Route | None = None  # the way through the panoramas; None without cameras
     target: int | None = None  # the panorama to go to; None if there is none
     has_stopped: bool = False  # whether they have, and a message has said so
-    minimap: bool = True
-    hotspots: bool = True
+    plan: bool = True
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
     path_seconds: float = 0.0  # time on the path that the panel shows
     path_playing: bool = False  # whether the camera moves along the path

@@ -19,13 +19,13 @@ from pansplat.tours.floor import choose_camera_height, find_other_storeys
 from pansplat.tours.graph import DrawnPlace, TourGraph
 from pansplat.tours.linked_rooms import place_rooms
 from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.placing_by_hand import PlanView
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
 
 SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0
 _VIEW_LENGTH = 1.0  # metres, of the camera's field of view
-_PLAN_MARGIN = 0.5  # metres, around the panoramas and floors
 _DASH = 5.0  # pixels, of an outline
 
 Color = tuple[float, float, float, float]
@@ -47,21 +47,21 @@ _COLORS = (
 def describe_panorama(tour: TourGraph, node: int) -> str:
     """The label of a panorama, and how sure its place is."""
     label, placement = tour.panoramas[node].label, tour.panoramas[node].placement
+    if not any(map(tour.is_placed, range(len(tour)))):
+        return label
     if not tour.is_placed(node):
         return f"{label} ({'about here' if node in tour.approximate else 'not placed'})"
     return f"{label} (placed by hand)" if placement.state == "by hand" else label
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, approximate and no place, and of fades on poor flights."""
-    flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
-    ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
+    """The number of panoramas, of several those with a known, approximate and no place."""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
-    if not alone:
-        return f"{describe_count(len(tour), 'panorama')}{ways}"
+    if alone in (0, len(tour)):
+        return describe_count(len(tour), "panorama")
     about = len(tour.approximate)
     counts = (len(tour) - alone, "placed"), (about, "about here"), (alone - about, "not placed")
-    return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
+    return ", ".join(f"{count} {name}" for count, name in counts if count)
 
 
 class Minimap:
@@ -85,16 +85,10 @@ class Minimap:
         floors = {n: self._move(n, outline.corners) for n, outline in scenes.outlines.items() if n not in dots}
         cameras = tour.positions @ tour.level_axes[:, (0, 2)]
         nodes = np.stack([self._move(node, place) for node, place in enumerate(cameras)])
-        places = np.concatenate([nodes, *floors.values()])
-        low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
-        factor, corner = SIZE * scale / float((high - low).max()), imgui.get_cursor_screen_pos()
-
-        def to_pixels(places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-            """Pixels of places to the right and forward, metres."""
-            return (places - (low[0], high[1])) * (factor, -factor) + (corner.x, corner.y)
-
-        width, height = ((high - low) * factor).tolist()
-        imgui.dummy((width, height))
+        corner, size = imgui.get_cursor_screen_pos(), (SIZE * scale, SIZE * scale)
+        view = PlanView.of_points(np.concatenate([nodes, *floors.values()]), size, (corner.x, corner.y))
+        to_pixels = view.to_pixels
+        imgui.dummy(size)
         hovered = imgui.is_item_hovered()
         for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
             shown = [node for node in floors if (node in others) == is_other and node not in self._drawn]

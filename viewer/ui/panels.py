@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
+from pansplat.tours.graph import TourGraph
 from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.settings import Display
 from pansplat_viewer.core.state import (
@@ -78,7 +79,7 @@ class Panels:
             draw_legend(state)
         if state.overlay and state.points:
             draw_points(state)
-        if state.overlay and state.hotspots:
+        if state.overlay and state.plan:
             draw_hotspots(viewer.hotspots)
             draw_notes(viewer)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
@@ -125,8 +126,8 @@ class Panels:
     def _draw_photographs(self, viewer: Viewer) -> None:
         """Draw where the camera can go, and the states of estimated poses."""
         state, placing = viewer.state, viewer.placing
-        if not state.is_tour:  # whose plan has a list
-            self._draw_panoramas(state, viewer.panoramas)
+        if state.graph is not None:
+            self._draw_list(state, state.graph)
         if self.widgets.button("Stop" if state.playing else "Fly"):
             toggle_play(state)
         imgui.same_line()
@@ -140,27 +141,14 @@ class Panels:
             self.widgets.section("Poses", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
 
     def _draw_plan(self, viewer: Viewer, tour: TourScenes) -> None:
-        """Draw the floor plan and the list of panoramas, and the progress of the prediction."""
-        state, nodes = viewer.state, range(len(tour.tour))
-        is_known = len(tour.outlines) > 0 or any(map(tour.tour.is_placed, nodes))  # else all are side by side
-        state.minimap = self.widgets.check("floor plan", state.minimap)
-        imgui.same_line()
-        state.hotspots = self.widgets.check("hotspots", state.hotspots)
-        if state.minimap and is_known:
+        """Draw the floor plan, and the progress of the prediction."""
+        state = viewer.state
+        state.plan = self.widgets.check("floor plan and rings", state.plan)
+        if state.plan and (tour.outlines or any(map(tour.tour.is_placed, range(len(tour.tour))))):  # else side by side
             clicked = self.minimap.draw(tour, state.camera)
             state.target = state.target if clicked is None else clicked
             if tour.tour.approximate:
                 imgui.text_disabled("dashed: about here")
-        imgui.set_next_item_width(-1)
-        if imgui.begin_combo("##visit", describe_panoramas(tour.tour) if is_known else "go to a photograph"):
-            for node in nodes:
-                label = describe_panorama(tour.tour, node) if is_known else tour.tour.panoramas[node].label
-                if imgui.selectable(f"{node + 1}. {label}", False)[0]:
-                    state.target = node
-                self.widgets.record(f"visit {node}")
-            imgui.end_combo()
-        else:
-            self.widgets.record("visit")
         if viewer.session.background is not None:
             task, fraction = viewer.session.background
             draw_wrapped(task)
@@ -265,16 +253,17 @@ class Panels:
             state.camera = replace(state.camera, vertical_fov_degrees=chosen)
         state.speed = self.widgets.slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
 
-    def _draw_panoramas(self, state: ViewerState, names: list[str]) -> None:
-        """Draw a button for each panorama, in rows."""
-        style, right = imgui.get_style(), imgui.get_window_pos().x + imgui.get_window_width()
-        for view, name in enumerate(names):
-            width = imgui.calc_text_size(name).x + 2 * style.frame_padding.x + style.item_spacing.x
-            if view and imgui.get_item_rect_max().x + width < right - style.window_padding.x:
-                imgui.same_line()
-            if imgui.button(f"{name}##panorama {view}"):
-                go_to_view(state, view)
-            self.widgets.record(f"{view + 1}##panorama")
+    def _draw_list(self, state: ViewerState, graph: TourGraph) -> None:
+        """Draw the list of panoramas; a click leads there."""
+        imgui.set_next_item_width(-1)
+        if imgui.begin_combo("##visit", describe_panoramas(graph)):
+            for node in range(len(graph)):
+                if imgui.selectable(f"{node + 1}. {describe_panorama(graph, node)}", False)[0]:
+                    go_to_view(state, node)
+                self.widgets.record(f"visit {node}")
+            imgui.end_combo()
+        else:
+            self.widgets.record("visit")
 
     def _draw_display(self, state: ViewerState) -> None:
         for number, display in enumerate(get_args(Display)):

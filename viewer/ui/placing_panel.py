@@ -70,7 +70,7 @@ class PlacingWindow:
     """Draws the window of the panorama that is being placed.
 
     Attributes:
-        corner, view: of the plan in the last frame, pixels; for tests that drag.
+        view: of the plan in the last frame.
     """
 
     def __init__(self, ctx: moderngl.Context, widgets: Widgets) -> None:
@@ -78,7 +78,6 @@ class PlacingWindow:
         self._ctx, self._widgets = ctx, widgets
         self._texture: moderngl.Texture | None = None
         self._shown: Piece | None = None  # in the texture
-        self.corner = (0.0, 0.0)
         self.view = PlanView((0.0, 0.0), 1.0, (1.0, 1.0))
         self._fitted: tuple[object, ...] = ()  # what the view was fitted to
         self._held: str | None = None  # what the pointer drags
@@ -151,7 +150,6 @@ class PlacingWindow:
         """Draw the plan, and apply the pointer and the wheel to the panorama."""
         available, at = imgui.get_content_region_avail(), imgui.get_cursor_screen_pos()
         size = (max(available.x, 50.0), max(available.y - 56 * scale, 50.0))
-        self.corner = (at.x, at.y)
         imgui.invisible_button("plan", size)
         self._widgets.record("plan")
         self._handle(placing, scale)
@@ -161,12 +159,13 @@ class PlacingWindow:
         shown = {node: outline for node, outline in outlines.items() if outline is not None}
         if not shown:
             return
-        points, key = np.concatenate(list(shown.values())), (placing.node, tuple(shown), size)
+        corner, points = (at.x, at.y), np.concatenate(list(shown.values()))
+        key = placing.node, tuple(shown), size, corner
         if key != self._fitted or (self._held is None and not self.view.contains(points)):
-            self._fitted, self.view = key, PlanView.of_points(points, size)
+            self._fitted, self.view = key, PlanView.of_points(points, size, corner)
         canvas, end = imgui.get_window_draw_list(), (at.x + size[0], at.y + size[1])
-        canvas.push_clip_rect(self.corner, end, True)
-        canvas.add_rect_filled(self.corner, end, _color(_BACK))
+        canvas.push_clip_rect(corner, end, True)
+        canvas.add_rect_filled(corner, end, _color(_BACK))
         shapes = {node: self._to_screen(outline) for node, outline in shown.items()}
         others = [node for node in shown if node in placing.targets]
         for node in others:
@@ -189,7 +188,7 @@ class PlacingWindow:
         canvas.pop_clip_rect()
 
     def _to_screen(self, places: Float[np.ndarray, "n 2"]) -> list[tuple[float, float]]:
-        return [(x + self.corner[0], y + self.corner[1]) for x, y in self.view.to_pixels(places).tolist()]
+        return [(x, y) for x, y in self.view.to_pixels(places).tolist()]
 
     def _draw_camera(
         self, canvas: imgui.ImDrawList, place: PlanPose, color: Color, scale: float

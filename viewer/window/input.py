@@ -78,10 +78,6 @@ def _write_screenshot(viewer: Viewer, events: Input) -> None:
     viewer.queue(viewer.write_screenshot, "exr" if "shift" in events.held else "png")
 
 
-def _toggle_plan(state: ViewerState) -> None:
-    state.minimap = state.hotspots = not state.minimap
-
-
 def _restart(state: ViewerState) -> None:
     state.points = []
     go_home(state)
@@ -118,7 +114,7 @@ KEYS = (
         {"page down": _change(_jump_by, 1), "page up": _change(_jump_by, -1)},
     ),
     KeyRow("Space", "play the way through them", {"space": _change(toggle_play)}),
-    KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
+    KeyRow("M", "floor plan and rings of a tour", {"m": _toggle("plan")}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
     KeyRow("R", "back to the start", {"r": _change(_restart)}),

@@ -67,7 +67,7 @@ def test_a_place_outside_of_the_image_or_under_the_panel_is_an_arrow_to_where_th
     scenes.move(house.positions[1])
     back, ahead = find_hotspots(scenes, replace(camera, pitch_radians=-0.4), (1280, 720), 290.0)
     assert (back.node, back.is_arrow, ahead.node, ahead.is_arrow) == (0, True, 2, False), "0 is behind the camera"
-    for yaw, side in ((0.9, "left"), (-0.9, "right"), (0.0, "below")):
+    for yaw, side in ((1.2, "left"), (-1.2, "right"), (0.0, "below")):
         spots = find_hotspots(scenes, replace(camera, yaw_radians=yaw, pitch_radians=0.3), (1280, 720), 290.0)
         (spot,) = [spot for spot in spots if spot.node == 2]
         x, y = spot.center

@@ -24,7 +24,6 @@ from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.core.stop_fade import StopFade
 from pansplat_viewer.core.tour_scenes import TourScenes, measure_bytes
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
-from pansplat_viewer.ui.minimap import describe_panoramas
 
 
 @pytest.fixture
@@ -93,7 +92,7 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
     first = SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
     scenes = TourScenes.start(load_house(first))
     camera = scenes.tour.cam2world[0].numpy()
-    assert scenes.plan_way(camera, (1,)).steps[0].kind == "flight" and "fades" not in describe_panoramas(scenes.tour)
+    assert scenes.plan_way(camera, (1,)).steps[0].kind == "flight"
     (part,) = scenes.list_next(None, 0.0)
     for _ in range(2):
         loaded = load_house(scenes.make_entry(part))
@@ -101,8 +100,6 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
         scenes.add(loaded)
     assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
     assert scenes.plan_way(camera, (1,)).steps[0].kind == "zoom"
-    edges = sum(a != b for a, b in scenes.tour.overlaps)
-    assert describe_panoramas(scenes.tour).endswith(f"; {edges - 1} flights, 1 fade")
 
 
 def test_a_zoom_shows_both_photographs_and_ends_in_that_of_its_goal(parted_house):
