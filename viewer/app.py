@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _WRITTEN = "[0-9]*_*.png", "film.mp4"  # offscreen
 _WINDOW_SIZE, _FILM_SIZE = (1280, 720), (1920, 1080)  # pixels
 _SETTINGS = DrawSettings(mode="deferred")
-_PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
+_PREDICTION_PART = 0.6  # share of the prediction in the progress of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
 
@@ -118,7 +118,7 @@ def _run(options: Options) -> int:
         require_output_folder("the folder", Path("renders"))
     if path is not None:
         raise InputError("--path needs a window; `pansplat render SCENE --path FILE -o film.mp4` draws its film")
-    with progress_bar():  # of poses, which take minutes for a tour without them
+    with progress_bar():  # the poses of a tour without them take minutes
         entries = find_entries(expand_home(options.path), options.reading, options.prediction)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)

@@ -22,7 +22,7 @@ from pansplat_viewer.core.state import ViewerState, enter_scene, fit_settings
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 
-FIELD_OF_VIEW = 75.0  # of films, vertical, degrees
+FIELD_OF_VIEW = 75.0  # vertical field of view of films, degrees
 _ORBIT_SECONDS, _ORBIT_STILLS = 4.0, 4  # duration of the film around a scene without cameras, and its stills
 
 

@@ -70,7 +70,9 @@ class Session:
         self.current = -1
         self.path: Path | None = None
         self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
-        self._kept: tuple[list[SceneEntry], int, Path | None] | None = None  # of the scene that is shown
+        self._kept: tuple[list[SceneEntry], int, Path | None] | None = (
+            None  # what `entries`, `current` and `path` were for the scene that is shown
+        )
         self.shown: TrackedScene | None = None
         self.coming: TrackedScene | None = None
         self.tour: TourScenes | None = None

@@ -12,7 +12,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from imgui_bundle import imgui
 
+from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
@@ -47,8 +47,8 @@ from pansplat_viewer.window.input import apply_input, read_input
 from pansplat_viewer.window.recent import add_recent, read_recent
 
 PANORAMA_HEIGHT = 1024  # pixels, of screenshots
-_MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
-_NOTE_COSINE = math.cos(math.radians(5))  # of the angle within which a note is at the middle of the image
+_MAX_STEP_SECONDS = 0.25  # longest camera movement of one frame
+_NOTE_COSINE = math.cos(math.radians(5))  # within this angle of the image's middle, a note is there
 
 
 class Viewer:
@@ -249,7 +249,7 @@ class Viewer:
         return point
 
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
-        """Write the image, or the panorama at the camera, as PNG, or EXR with depth in metres.
+        """Write the image as PNG, or EXR with depth in metres, or the panorama at the camera without its display.
 
         The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
         """
@@ -257,12 +257,14 @@ class Viewer:
         if loaded is None or stage.photograph is not None:
             state.show_message("there is no scene of this place yet")
             return
-        settings = replace(state.draw_settings, layout="equirect" if panorama else "pinhole")
-        size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.size
         stage.slot.image = None  # the texture will hold the screenshot
+        pose, settings, depth = state.camera.cam2world, state.draw_settings, None
         try:
-            pose = state.camera.cam2world
-            color, depth = render_image(stage.renderer, pose, size, settings, with_depth=suffix == "exr")
+            if panorama:
+                blend, size = settings.view if settings.mode == "view" else settings.mode, PANORAMA_HEIGHT
+                color = pipeline.render(stage.slot.scene, pose, blend=blend, size=(size, 2 * size)).color
+            else:
+                color, depth = render_image(stage.renderer, pose, stage.size, settings, with_depth=suffix == "exr")
             folder, stem = self._folder / loaded.entry.folder_name, "panorama" if panorama else "view"
             folder.mkdir(parents=True, exist_ok=True)
             files = (folder / f"{stem}_{number:03d}.{suffix}" for number in itertools.count(1))

@@ -30,7 +30,7 @@ from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
 from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
 
-_HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
+_HEIGHTS = (512, 1024, 2048, 4096)  # rows of photographs in memory; the least that is as dense as the frame is read
 
 Image = Float[np.ndarray, "height width 3"]
 Pose = Float[np.ndarray, "4 4"]
@@ -58,8 +58,8 @@ class FilmPhotographs:
         """
         self._poses = cam2world[: len(photographs)].double().cpu()
         self._gains = torch.tensor(gains)[:, :, None, None] if gains else None
-        self._weights: dict[int, float] = {}  # of the photographs near the poses of the last frame
-        self._seconds = 0.0  # of the last frame
+        self._weights: dict[int, float] = {}  # weights of the photographs near the poses of the last frame
+        self._seconds = 0.0  # time of the last frame
 
         @functools.lru_cache(maxsize=2)
         def load(index: int, height: int) -> Float[Tensor, "4 height width"]:

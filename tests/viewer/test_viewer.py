@@ -1,6 +1,5 @@
 """State and input of the whole viewer, without OpenGL and without a window: nothing is drawn."""
 
-import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +24,6 @@ from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.progress import report_progress
-from pansplat.tours.camera_path import CameraPath
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry, SceneLoader, load_entry
 from pansplat_viewer.core.settings import FrameStats
 from pansplat_viewer.core.state import ViewerState
@@ -410,25 +408,23 @@ def test_a_refined_scene_that_cannot_be_drawn_is_one_error_and_the_prediction_st
     assert app.viewer.stage.slot.scene is prediction and refusals == [refined] and app.viewer.error is None
 
 
-def test_a_scene_beyond_the_memory_is_an_error_and_the_scene_before_stays(app, small_scene, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError("too many"), "large: the memory is exhausted (MemoryError: too many); open a scene with fewer"),
+        (moderngl.Error("GLSL Compiler failed"), "large: OpenGL failed: GLSL Compiler failed"),
+    ],
+)
+def test_a_scene_that_cannot_be_drawn_is_an_error_and_the_scene_before_stays(
+    app, small_scene, monkeypatch, error, message
+):
     twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
-    refuse = staticmethod(lambda scene: MemoryError("too many") if scene is twice else None)
-    monkeypatch.setattr(NoRenderer, "refuse", refuse)
+    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error if scene is twice else None))
     app.load = lambda entry, *_: LoadedScene(entry, twice)
     app.show(SceneEntry("large"))
-    assert (
-        app.viewer.error == "large: the memory is exhausted (MemoryError: too many); open a scene with fewer Gaussians"
-    )
-    assert app.session.names == ["large"]
+    assert app.viewer.error.startswith(message) and app.session.names == ["large"]
     app.viewer.dismiss_error()
     assert app.viewer.stage.slot.scene is small_scene and app.session.names == ["first", "second"]
-
-
-def test_an_error_of_opengl_is_not_called_exhausted_memory(app, monkeypatch):
-    error = moderngl.Error("GLSL Compiler failed")
-    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error))
-    app.show(SceneEntry("refused"))
-    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed"
 
 
 def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(app, monkeypatch):
@@ -539,26 +535,12 @@ def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
     assert app.viewer.error.startswith("no screenshot written: the memory is exhausted (MemoryError: no memory)")
 
 
-@pytest.fixture
-def path_app(app) -> App:
-    """The viewer with a path of two key frames, 1 s apart, at the second."""
+def test_a_path_replaces_its_own_file_only(app, tmp_path):
     app.press("k")
-    app.state.camera = replace(app.state.camera, position=(0.2, 0.0, 0.3), yaw_radians=0.5)
-    app.state.path_seconds = 1.0
-    app.press("k")
-    assert [frame.seconds for frame in app.state.path.key_frames] == [0.0, 1.0]
-    return app
-
-
-def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path):
-    app, path, viewer = path_app, path_app.state.path, path_app.viewer
-    walk, own = str(tmp_path / "walk.json"), tmp_path / "own.json"
-    viewer.save_path(walk)
-    app.state.path = CameraPath()
-    viewer.open_path(walk)
-    assert app.state.path == path
-    viewer.save_path(walk)
-    assert viewer.error is None, "pansplat wrote the file"
+    viewer, walk, own = app.viewer, str(tmp_path / "walk.json"), tmp_path / "own.json"
+    for _ in range(2):
+        viewer.save_path(walk)
+        assert viewer.error is None, "pansplat wrote the file"
     own.write_text("{}")
     for act, name in ((viewer.open_path, "missing.json"), (viewer.save_path, "own.json")):
         act(str(tmp_path / name))
@@ -629,36 +611,6 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app.state.camera = replace(app.state.camera, position=(0.0, 0.0, 0.4))
     app.viewer.put_note("between")
     assert file.read_bytes() == written and "at a panorama" in app.state.message
-    file.unlink()
-
-
-def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
-    """Notes of before, of another window or by hand stay, also where poses were found since, or the key is another."""
-    app, file = make_app(), house.folder / "links.json"
-    first, *others = house.panoramas
-    first = replace(first, links_at=(file, ("room0.png", "room0"), ()))
-    entries = [SceneEntry("house", tour=replace(house, panoramas=(first, *others))), SceneEntry("other")]
-    posed = replace(house, panoramas=(replace(first), *others))  # as it was loaded, before any note
-    app.show(*entries)
-    app.viewer.put_note("one")
-    app.session.choose(1)
-    app.settle()
-    for shown in (entries[0], SceneEntry("house", tour=posed)):
-        app.show(shown)
-        index = app.viewer.stage.photographs.find_stop(np.asarray(app.state.camera.position))
-        assert app.viewer.stage.photographs.list_notes(index)[0].text == "one"
-        content = json.loads(file.read_text())
-        (entry,) = content.values()
-        entry["notes"].append({"yaw": 2.0 + len(entry["notes"]), "pitch": 0, "text": "by hand", "colour": "red"})
-        file.write_text(json.dumps({"room0": entry, "of the user": 1}))
-        app.state.camera = replace(app.state.camera, yaw_radians=app.state.camera.yaw_radians + 1)
-        app.viewer.put_note("more")
-        content = json.loads(file.read_text())
-        assert content.keys() == {"room0", "of the user"} and entry["notes"] == content.pop("room0")["notes"][:-1]
-        file.write_text(json.dumps({"room0": entry}))
-    file.unlink()
-    app.viewer.put_note("last")
-    assert [note["text"] for note in json.loads(file.read_text())["room0.png"]["notes"]] == ["last"]
     file.unlink()
 
 

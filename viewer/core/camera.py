@@ -163,13 +163,11 @@ class Pinhole:
         return normals @ self.rotation.T
 
 
-def create_face_cameras(
-    orientation: Float[np.ndarray, "3 3"], position: tuple[float, float, float], face_size: int, border: int
-) -> list[Pinhole]:
-    """Return the six face cameras of a cube with axes `orientation` (to world), with `border` extra pixels a side."""
+def create_face_cameras(position: tuple[float, float, float], face_size: int, border: int) -> list[Pinhole]:
+    """Return the six face cameras of a cube along the world's axes, with `border` extra pixels a side."""
     side = face_size + 2 * border
     rotations = face_rotations().numpy()
-    return [Pinhole(orientation @ face, position, 0.5 * face_size, side, side) for face in rotations]
+    return [Pinhole(face, position, 0.5 * face_size, side, side) for face in rotations]
 
 
 def find_faces_in_view(camera_to_faces: Float[np.ndarray, "3 3"], half_size: tuple[float, float]) -> list[int]:

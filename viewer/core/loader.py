@@ -29,7 +29,7 @@ ShowEntries = Callable[[list["SceneEntry"]], None]
 Find = Callable[[Path, ShowEntries], list["SceneEntry"]]
 
 
-_WAIT = 0.01  # seconds between looks at a search
+_WAIT = 0.01  # time between two looks at a search, seconds
 
 
 def make_file_name(name: str) -> str:
@@ -51,10 +51,10 @@ class SceneEntry:
     pair: "PanoramaSet | None" = None
     file: Path | None = None  # the scene file, or None
     tour: "TourGraph | None" = None  # the tour, or None
-    views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
+    views: tuple[int, ...] = ()  # numbers in the tour of the panoramas of one of its scenes
     start: int | None = None
     max_views: int = 1
-    merged: "Scene | None" = None  # of a tour from a file: the scene in it, of all panoramas
+    merged: "Scene | None" = None  # the scene of all panoramas, if the tour is from a file
     notes: tuple[str, ...] = ()  # what was not used or not placed at its path, and why
 
     @property

@@ -52,7 +52,7 @@ def pick_point(
     pose[:3, 0] = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)  # an axis that is not along the ray
     pose[:3, 0] /= np.linalg.norm(pose[:3, 0])
     pose[:3, 1], pose[:3, 2], pose[:3, 3] = np.cross(direction, pose[:3, 0]), direction, origin
-    settings = replace(settings, layout="pinhole", scale=1.0, vertical_fov_degrees=_FOV_DEGREES)
+    settings = replace(settings, scale=1.0, vertical_fov_degrees=_FOV_DEGREES)
     _, depths = render_image(renderer, pose, (_SIZE, _SIZE), settings, with_depth=True)
     assert depths is not None
     depth = float(depths[_SIZE // 2, _SIZE // 2])

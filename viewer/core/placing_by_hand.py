@@ -25,9 +25,9 @@ from pansplat_viewer.core.loader import SceneEntry, list_panoramas
 if TYPE_CHECKING:
     from pansplat_viewer.window.input import Input
 
-WALL_ANGLE = math.radians(6)  # within which walls become parallel
-_APART = 0.3  # metres, between a door or the others and a panorama of which no place is known
-_PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # metres, around what a plan shows, and of its sides
+WALL_ANGLE = math.radians(6)  # walls within this angle become parallel
+_APART = 0.3  # distance of a panorama without a known place from a door or the others, metres
+_PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # margin around what a plan shows, and its least side, metres
 
 Nodes = tuple[int, ...]
 
@@ -68,7 +68,7 @@ class PlacingByHand:
         self.node: int | None = None
         self.targets: Nodes = ()
         self._anchor = 0  # the one of `targets` that the first place is relative to
-        self._world: int | None = None  # of `targets`; None if they have no pose
+        self._world: int | None = None  # number of the world of `targets`; None if they have no pose
         self.floor = PlanFrame(np.eye(3), 1.0)
         self.place: PlanPose | None = None
         self._is_changed = False  # whether the poses of `panoramas` are older than the file

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from pansplat.constants import NEAR
-from pansplat.errors import InputError
 
 Mode = Literal["joint", "view", "deferred"]
-Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Display = Literal["color", "depth", "opacity", "levels", "views"]
 
-_CHOICES = {"mode": Mode, "layout": Layout, "display": Display}
 _BLUR_STEPS = 20  # a metre, to which the movement of an exposure is rounded up, so that selections serve several frames
 SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis"}
 """Displays of one number a pixel, and their colour maps."""
@@ -31,7 +28,7 @@ class DrawSettings:
         display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `levels` and
             `views`, a colour for each label.
         display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
-        cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
+        cached: draw the image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
         shift: movement of the camera while the picture is exposed, metres, world axes: Gaussians blur along it.
@@ -46,28 +43,10 @@ class DrawSettings:
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
     near: float = NEAR  # Gaussians whose mean is nearer than this radial distance, metres, are not drawn
-    vertical_fov_degrees: float = 90.0  # of layout `pinhole`, in (0, 180)
-    layout: Layout = "pinhole"  # `pinhole`, or `equirect`, which OpenGL stitches from six cube faces
+    vertical_fov_degrees: float = 90.0  # in (0, 180)
     cached: bool = False
     scale: float = 1.0
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in get_args(choices):
-                raise InputError(f"`{name}` must be one of {', '.join(get_args(choices))}, got {value!r}")
-        if not 0 < self.vertical_fov_degrees < 180:
-            raise InputError(
-                f"`vertical_fov_degrees` must be between 0 and 180, got {self.vertical_fov_degrees}; "
-                "use layout equirect for a whole panorama"
-            )
-        if not 0 < self.display_max < math.inf:
-            raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
-        if not 0 < self.near < math.inf:
-            raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
-        if not 0 < self.scale <= 1:
-            raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
 
     @property
     def shows_scene(self) -> bool:

@@ -44,10 +44,9 @@ class ViewerState:
     overlay: bool = True
     help: bool = False
     stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
-    speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     num_views: int = 0  # number of input cameras of the scene that is shown
-    graph: TourGraph | None = None  # of the cameras, whose surfaces stop the camera; None without cameras
+    graph: TourGraph | None = None  # the input cameras, whose surfaces stop the camera; None without any
     is_tour: bool = False  # whether that is the graph of a tour
     route: Route | None = None  # the way through the panoramas; None without cameras
     target: int | None = None  # the panorama to go to; None if there is none

@@ -22,8 +22,8 @@ from pansplat.tours.route import Route, plan_route
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry
 from pansplat_viewer.core.tracked_scene import TrackedScene
 
-_MEMORY = 2 << 30  # bytes of the scenes of a tour that are kept; two predictions are kept in any case
-_NEXT_SCENES = 3  # that are dropped last
+_MEMORY = 2 << 30  # bytes that the scenes of a tour may take; two predictions are kept in any case
+_NEXT_SCENES = 3  # number of the next predictions of a way, which are dropped last
 
 
 class TourScenes:

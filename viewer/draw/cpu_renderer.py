@@ -40,7 +40,7 @@ from pansplat_viewer.core.camera import Pinhole
 from pansplat_viewer.core.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
+from pansplat_viewer.draw.frames import Frame, choose_layer_weights
 from pansplat_viewer.draw.splats import Splats, drop_not_finite, select_in_view
 
 if TYPE_CHECKING:
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
 
     from pansplat_viewer.draw.renderer import SplatRenderer
 
-_MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
+_MIN_WEIGHT = 2.0**-26  # least weight of a view in deferred blending, as in OpenGL with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
-_MAX_FACE_SETS = 5
-_MAX_SELECTIONS = 8
-_MAX_TEXTURES = 4
+_MAX_FACE_SETS = 5  # positions whose cube faces are kept; the oldest set goes
+_MAX_SELECTIONS = 8  # selections of levels and views that are kept, a byte or two a Gaussian each
+_MAX_TEXTURES = 4  # textures of different sizes that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class _Groups:
     """The sets of Gaussians that the layers show."""
 
     labels: Int[np.ndarray, "n"]  # layer of each Gaussian, or `NO_LAYER`
-    weights: Float[np.ndarray, "layer"]  # of the layers
+    weights: Float[np.ndarray, "layer"]  # weight of each layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class _FaceSet:
     """Cube faces of one position and settings, and those that are finished."""
 
     faces: PixelFaces
-    groups: _Groups  # of the first frame, in whose direction the weights are chosen
+    groups: _Groups  # its weights are chosen in the direction of the first frame
     done: set[int] = field(default_factory=set)
 
     def find_missing(self, frame: Frame) -> list[int]:
@@ -174,7 +174,7 @@ class CpuRenderer:
                 f"the image needs {largest} pixels a side, the limit is {LARGEST_SIDE}; use a smaller size"
             )
         groups = self._choose_groups(frame)
-        if frame.storage == LayerStorage.PADDED_FACES:
+        if frame.has_faces:
             return self._show(self._read_from_faces(frame, groups))
         key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.full_size, settings)
         if self._pending != key:
@@ -197,7 +197,7 @@ class CpuRenderer:
     def has_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> bool:
         """Whether the cube faces that the camera reads are finished."""
         frame = self._create_cached_frame(cam2world, size, settings)
-        if frame.storage != LayerStorage.PADDED_FACES:
+        if not frame.has_faces:
             return False
         stored = self._faces.get(_face_key(frame))
         return stored is not None and not stored.find_missing(frame)
@@ -207,7 +207,7 @@ class CpuRenderer:
         if self._worker.future is not None and not self._worker.future.done():
             return
         frame = self._create_cached_frame(cam2world, size, settings)
-        if frame.storage != LayerStorage.PADDED_FACES:
+        if not frame.has_faces:
             return
         stored = self._find_face_set(frame)
         if len(stored.done) < 6:
@@ -274,8 +274,7 @@ class CpuRenderer:
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
         start = time.perf_counter()
-        focal = frame.focal if frame.settings.layout == "pinhole" else 0.0
-        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), focal)
+        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), frame.focal)
         layers = self._rasterize(frame, groups, plane, self._selected)
         sums = layers.sums
         stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
@@ -290,11 +289,9 @@ class CpuRenderer:
     def _rasterize(
         self, frame: Frame, groups: _Groups, plane: ImagePlane, cache: SelectionCache | None = None
     ) -> Layers:
-        """Rasterise the Gaussians in view of a plane; a panorama has a ray for each pixel."""
-        selection = None
-        if not plane.is_panorama:
-            camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
-            selection = select_in_view(camera, frame.settings.largest_blur)
+        """Rasterise the Gaussians in view of a plane."""
+        camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
+        selection = select_in_view(camera, frame.settings.largest_blur)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt
 from pansplat.errors import InputError
 from pansplat_viewer.core.camera import Pinhole
 from pansplat_viewer.core.settings import DrawSettings
-from pansplat_viewer.draw.frames import Frame, LayerStorage
+from pansplat_viewer.draw.frames import Frame
 from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, checking_memory, set_uniforms
 from pansplat_viewer.draw.splats import SortedSplats, Splats
 
@@ -148,9 +148,9 @@ class LayerPainter:
         selected = self._select(frame.settings, view)
         cameras = frame.create_layer_cameras()
         width, height = cameras[0].width, cameras[0].height
-        size = (width, height) if frame.storage == LayerStorage.IMAGE else (3 * width, 2 * height)
+        size = (3 * width, 2 * height) if frame.has_faces else (width, height)
         target = self._targets.get(
-            (frame.storage, view), size, depth_components=int(with_depth), key=frame.create_layer_key(splats)
+            (frame.has_faces, view), size, depth_components=int(with_depth), key=frame.create_layer_key(splats)
         )
         missing = [part for part in frame.find_parts_in_view() if part not in target.parts]
         places = {part: (part % 3 * width, part // 3 * height, width, height) for part in missing}

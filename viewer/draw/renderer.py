@@ -1,4 +1,4 @@
-"""Draws a scene's Gaussians with OpenGL into a texture: any pose, pinhole or panorama, any blending mode.
+"""Draws a scene's Gaussians with OpenGL into a texture: any pose and blending mode.
 
 Needs no window. All calls must come from the thread of the context. `SplatRenderer._draw` has the data flow of a frame:
 the splats are painted into layers (one for each set of Gaussians), and the layers are composed to the image.
@@ -23,7 +23,7 @@ from pansplat_viewer.core.background import BackgroundWorker
 from pansplat_viewer.core.settings import SCALAR_MAPS, DrawSettings, FrameStats
 from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
+from pansplat_viewer.draw.frames import Frame, choose_layer_weights
 from pansplat_viewer.draw.layers import LayerPainter, Target, TargetStore
 from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
@@ -66,8 +66,6 @@ class SplatRenderer:
         """
         if color_bits is None:
             color_bits = 32 if is_software(ctx) else 16
-        if color_bits not in (16, 32):
-            raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
         self.stats = FrameStats()
         self._ctx = ctx
         self._programs = Programs(ctx)
@@ -244,7 +242,7 @@ class Compositor:
         self._ctx = ctx
         self._programs = programs
         self._targets = targets
-        self._accumulate: dict[LayerStorage, moderngl.VertexArray] = {}
+        self._accumulate: dict[bool, moderngl.VertexArray] = {}
         self._resolve = ctx.vertex_array(programs.resolve(), [])
         self._tables: dict[str, moderngl.Texture] = {}
 
@@ -288,15 +286,15 @@ class Compositor:
         target = self._targets.get("sum", frame.size, depth_components=2)
         target.framebuffer.use()
         target.framebuffer.viewport = (0, 0, *frame.size)
-        program = self._programs.accumulate(frame.storage)
-        if frame.storage not in self._accumulate:
-            self._accumulate[frame.storage] = self._ctx.vertex_array(program, [])
+        program = self._programs.accumulate(frame.has_faces)
+        if frame.has_faces not in self._accumulate:
+            self._accumulate[frame.has_faces] = self._ctx.vertex_array(program, [])
         set_uniforms(
             program,
             with_depth=with_depth,
             size=frame.size,
             focal=frame.focal,
-            camera_to_faces=np.ascontiguousarray(frame.camera_to_faces.T, dtype=np.float32).tobytes(),
+            camera_to_faces=np.ascontiguousarray(frame.rotation.T, dtype=np.float32).tobytes(),
             face_size=frame.face_size,
         )
         self._ctx.enable_only(moderngl.NOTHING)  # the first layer overwrites the target, the others are added
@@ -305,7 +303,7 @@ class Compositor:
         for layer, weight in weighted:
             set_uniforms(program, weight=weight)
             self._bind_textures(program, layer_color=layer.color, layer_depth=layer.depth)
-            self._accumulate[frame.storage].render(moderngl.TRIANGLES, vertices=3)
+            self._accumulate[frame.has_faces].render(moderngl.TRIANGLES, vertices=3)
             self._ctx.enable_only(moderngl.BLEND)
         self._ctx.enable_only(moderngl.NOTHING)
         self._ctx.blend_equation = moderngl.FUNC_ADD

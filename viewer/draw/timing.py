@@ -3,7 +3,7 @@
 `pansplat bench viewer` runs this command, because no other package may import the viewer. Needs no window. A job is
 
     {"scene": "scene.ply", "pose": 4x4 cam2world, "size": [width, height], "repeats": 5, "folder": "images",
-     "renderers": ["gl", "cpu"], "settings": [{"layout": "equirect", ...}, ...]}
+     "renderers": ["gl", "cpu"], "settings": [{"mode": "joint", ...}, ...]}
 
 with the fields of `DrawSettings`, and optionally a "size" of its own. For each renderer and settings, one line of JSON
 is printed:

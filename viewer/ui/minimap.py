@@ -23,10 +23,10 @@ from pansplat_viewer.core.placing_by_hand import PlanView
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
 
-SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
-_CLICK_PIXELS = 12.0
-_VIEW_LENGTH = 1.0  # metres, of the camera's field of view
-_DASH = 5.0  # pixels, of an outline
+SIZE = 210  # side of the plan, pixels at a DPI scale of 1
+_CLICK_PIXELS = 12.0  # from a panorama, within which a click leads there, at a DPI scale of 1
+_VIEW_LENGTH = 1.0  # length of the lines that show the field of view, metres
+_DASH = 5.0  # length of a dash of an outline, pixels at a DPI scale of 1
 
 Color = tuple[float, float, float, float]
 
@@ -92,7 +92,7 @@ class Minimap:
         hovered = imgui.is_item_hovered()
         for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
             shown = [node for node in floors if (node in others) == is_other and node not in self._drawn]
-            _draw_floors([to_pixels(floors[node]) for node in shown], colors, scale)
+            draw_floors([floors[node] for node in shown], view, colors, scale)
         for node in self._drawn.keys() & floors.keys():
             _draw_dashed(to_pixels(floors[node]), scale)
         self.nodes = [tuple(pixel) for pixel in to_pixels(nodes).tolist()]
@@ -167,11 +167,13 @@ def _draw_dashed(corners: Float[np.ndarray, "corner 2"], scale: float) -> None:
         canvas.add_line((first.x, first.y), (last.x, last.y), color, 1.5 * scale)
 
 
-def _draw_floors(floors: list[Float[np.ndarray, "corner 2"]], colors: tuple[Color, Color], scale: float) -> None:
+def draw_floors(
+    floors: list[Float[np.ndarray, "corner 2"]], view: PlanView, colors: tuple[Color, Color], scale: float
+) -> None:
     """Draw walls around all floors together: an outline that ends in another one's floor has no wall there."""
     canvas = imgui.get_window_draw_list()
     wall, floor = map(imgui.color_convert_float4_to_u32, colors)
-    shapes = [[imgui.ImVec2(x, y) for x, y in corners.tolist()] for corners in floors]
+    shapes = [[imgui.ImVec2(x, y) for x, y in view.to_pixels(corners).tolist()] for corners in floors]
     for shape in shapes:
         canvas.add_polyline(shape, wall, thickness=3.0 * scale, flags=imgui.ImDrawFlags_.closed.value)
     for shape in shapes:

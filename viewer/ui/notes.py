@@ -14,7 +14,7 @@ from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-_RADIUS = 9.0  # of a mark, pixels at a DPI scale of 1
+_RADIUS = 9.0  # radius of a mark, pixels at a DPI scale of 1
 
 
 def draw_notes(viewer: Viewer) -> None:

@@ -12,7 +12,7 @@ from pansplat_viewer.core.settings import SCALAR_MAPS
 from pansplat_viewer.core.state import ViewerState
 from pansplat_viewer.draw.color_maps import get_table
 
-PANEL_WIDTH = 290.0  # of the main panel at first, pixels at a DPI scale of 1
+PANEL_WIDTH = 290.0  # width of the main panel before a user drags it, pixels at a DPI scale of 1
 MARGIN = 10.0  # from the border of the window, pixels
 FIXED = (  # flags of a window that is placed anew in each frame
     imgui.WindowFlags_.no_move.value | imgui.WindowFlags_.no_resize.value | imgui.WindowFlags_.no_saved_settings.value
@@ -25,9 +25,9 @@ _LABEL = (
     | imgui.WindowFlags_.no_focus_on_appearing.value
     | imgui.WindowFlags_.no_nav.value
 )
-_LEGEND_WIDTH = 180.0
-FADE_COLOR = (1.0, 0.75, 0.3)  # of panoramas of other parts of a tour
-UNITS = {"depth": " m"}  # of displays whose range can be changed
+_LEGEND_WIDTH = 180.0  # pixels at a DPI scale of 1
+FADE_COLOR = (1.0, 0.75, 0.3)  # RGB of the marks of panoramas in other parts of a tour
+UNITS = {"depth": " m"}  # units of the displays whose range can be changed
 
 
 def draw_points(state: ViewerState) -> None:

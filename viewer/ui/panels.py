@@ -14,7 +14,6 @@ import moderngl
 from imgui_bundle import imgui
 
 from pansplat.tours.graph import TourGraph
-from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.settings import Display
 from pansplat_viewer.core.state import (
     KEY_SECONDS,
@@ -47,7 +46,7 @@ from pansplat_viewer.window.input import KEYS
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-_BAR_COLOR = (0.2, 0.4, 0.7, 1.0)  # of a progress that is behind a white text
+_BAR_COLOR = (0.2, 0.4, 0.7, 1.0)  # RGBA of a progress bar behind a white text
 _PANEL = imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_bring_to_front_on_focus.value
 
 
@@ -167,15 +166,12 @@ class Panels:
         self._draw_path(viewer)
 
     def _draw_expert(self, viewer: Viewer) -> None:
-        """Draw how the camera moves, and what is drawn of the Gaussians."""
-        imgui.separator_text("Camera")
-        self._draw_camera(viewer)
+        """Draw what is drawn of the Gaussians."""
+        state = viewer.state
         if viewer.stage.slot.scene is not None:
-            imgui.separator_text("Gaussians")
-            self._draw_gaussians(viewer.state)
-        imgui.separator_text("Display")
-        self._draw_display(viewer.state)
-        self._draw_settings(viewer)
+            self._draw_gaussians(state)
+        self._draw_display(state)
+        state.stops = self.widgets.check("photographs at panoramas", state.stops)
 
     def _draw_scene(self, viewer: Viewer) -> None:
         session, recent, width = viewer.session, viewer.recent, -60 * imgui.get_style().font_scale_dpi
@@ -233,25 +229,6 @@ class Panels:
                     shown.discard(level)
             settings = replace(settings, levels=None if shown == set(state.levels) else frozenset(shown))
         state.settings = settings
-
-    def _draw_settings(self, viewer: Viewer) -> None:
-        state, settings = viewer.state, viewer.state.settings
-        flags = imgui.ColorEditFlags_.no_inputs.value
-        changed, background = imgui.color_edit3("background", list(settings.background), flags)
-        self.widgets.record("background")
-        if changed:
-            settings = replace(settings, background=(background[0], background[1], background[2]))
-        state.settings = settings
-        state.stops = self.widgets.check("photographs at panoramas", state.stops)
-
-    def _draw_camera(self, viewer: Viewer) -> None:
-        state = viewer.state
-        state.orbiting = self.widgets.check("orbit", state.orbiting)
-        fov = state.camera.vertical_fov_degrees
-        chosen = self.widgets.slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
-        if chosen != fov:
-            state.camera = replace(state.camera, vertical_fov_degrees=chosen)
-        state.speed = self.widgets.slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
 
     def _draw_list(self, state: ViewerState, graph: TourGraph) -> None:
         """Draw the list of panoramas; a click leads there."""

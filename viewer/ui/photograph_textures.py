@@ -32,7 +32,7 @@ class PhotographTextures:
         self._positions: Float[np.ndarray, "photograph 3"] = np.zeros((0, 3))
         self._reading: dict[int, Future[UInt8[np.ndarray, "height width 3"]]] = {}
         self._failed: set[int] = set()
-        self._notes: dict[int, tuple[Note, ...]] = {}  # of panoramas that were shown
+        self._notes: dict[int, tuple[Note, ...]] = {}  # notes of the panoramas that were shown
         self._textures: OrderedDict[int, moderngl.Texture] = OrderedDict()
 
     def __len__(self) -> int:

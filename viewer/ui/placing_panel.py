@@ -16,12 +16,11 @@ from jaxtyping import Float
 from pansplat.inputs.placements import Placement
 from pansplat.poses.placing import Piece
 from pansplat_viewer.core.placing_by_hand import PlacingByHand, PlanPose, PlanView
+from pansplat_viewer.ui.minimap import Color, draw_floors
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
-
-Color = tuple[float, float, float, float]
 
 STATES: dict[str, Color] = {
     "sure": (0.45, 0.8, 0.5, 1.0),
@@ -32,10 +31,10 @@ _WALL, _FLOOR, _BACK = (0.9, 0.9, 0.92, 1.0), (0.3, 0.33, 0.37, 1.0), (0.1, 0.11
 _PIECE, _PIECE_FLOOR, _ALIGNED = (0.35, 0.8, 1.0, 1.0), (0.35, 0.8, 1.0, 0.22), (0.5, 1.0, 0.55, 1.0)
 _DOOR = (1.0, 0.6, 0.2, 1.0)
 _KNOB, _REACH = 34.0, 9.0  # pixels from the camera to the knob, and around the knob, at a DPI scale of 1
-_WHEEL = math.radians(1)  # of a step of the wheel
+_WHEEL = math.radians(1)  # angle that a step of the wheel turns a panorama by
 _BUTTONS = 150.0  # pixels from the list's left border to the buttons, at a DPI scale of 1
-_ROWS = 0.25, 0.7  # of the photograph that are shown
-_SIZE = 520.0  # of the window, pixels at a DPI scale of 1
+_ROWS = 0.25, 0.7  # the first and last row of the photograph that is shown, fractions of its height
+_SIZE = 520.0  # width of the window, pixels at a DPI scale of 1
 _FLAGS = imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_scroll_with_mouse.value
 
 
@@ -168,17 +167,15 @@ class PlacingWindow:
         canvas.add_rect_filled(corner, end, _color(_BACK))
         shapes = {node: self._to_screen(outline) for node, outline in shown.items()}
         others = [node for node in shown if node in placing.targets]
-        for node in others:
-            _draw_line(canvas, shapes[node], _WALL, 3 * scale)
-        for node in others:  # over the lines: an outline that ends in another one's floor draws no wall
-            canvas.add_concave_poly_filled(shapes[node], _color(_FLOOR))
+        draw_floors([shown[node] for node in others], self.view, (_WALL, _FLOOR), scale)
         for node in others:
             place, panorama = placing.find_place(node), placing.panoramas[node]
             x, y = self._draw_camera(canvas, place, STATES[describe_state(panorama.placement)], scale)
             canvas.add_text((x + 7 * scale, y - 8 * scale), _color(_WALL), panorama.label)
         for node in [node for node in shown if node not in others]:
             canvas.add_concave_poly_filled(shapes[node], _color(_PIECE_FLOOR))
-            _draw_line(canvas, shapes[node], _ALIGNED if placing.is_aligned else _PIECE, 2 * scale)
+            color, closed = _color(_ALIGNED if placing.is_aligned else _PIECE), imgui.ImDrawFlags_.closed.value
+            canvas.add_polyline(shapes[node], color, thickness=2 * scale, flags=closed)
         if placing.place is not None:
             half, center = 4 * scale, self._draw_camera(canvas, placing.place, _PIECE, scale)
             canvas.add_circle(center, _KNOB * scale, _color((*_PIECE[:3], 0.35)), 0, scale)
@@ -221,11 +218,6 @@ class PlacingWindow:
             placing.turn_to(math.atan2(mouse.x - x, y - mouse.y))
         if imgui.is_item_hovered() and io.mouse_wheel:
             placing.turn(io.mouse_wheel * _WHEEL)
-
-
-def _draw_line(canvas: imgui.ImDrawList, points: list[tuple[float, float]], color: Color, width: float) -> None:
-    """Draw a closed line; the order of the arguments differs among imgui's versions."""
-    canvas.add_polyline(points, _color(color), flags=imgui.ImDrawFlags_.closed.value, thickness=width)
 
 
 def _color(color: Color) -> int:

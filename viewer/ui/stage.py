@@ -28,7 +28,7 @@ from pansplat_viewer.ui.photograph_textures import PhotographTextures
 from pansplat_viewer.ui.presenter import PhotographLayer, PosedPhotograph, Presenter
 
 DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
-_EXPOSURE_SECONDS = 1 / 30  # of a frame of a flight, at most, by which its Gaussians blur
+_EXPOSURE_SECONDS = 1 / 30  # longest exposure of a frame of a flight, by which its Gaussians blur
 _JUMP = 1.0  # metres between two frames, which no flight flies
 
 
@@ -61,7 +61,7 @@ class Stage:
         self.preparer = ScenePreparer(self.renderer.prepare)
         self.presenter = Presenter(ctx)
         self.photographs = PhotographTextures(ctx)
-        self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
+        self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # photographs in a fade
         self._stop_layer, self._zoom_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
         self.resolution = self._create_resolution()
         self.size: tuple[int, int] = (1, 1)

@@ -18,7 +18,7 @@ from pansplat_viewer.core.state import ViewerState, add_key_frame, go_home, go_t
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-SLOW = 0.2  # of the speed, while Alt is held
+SLOW = 0.2  # factor of the speed while Alt is held
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
 ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
@@ -38,7 +38,7 @@ class Input:
     drag: tuple[float, float] = (0.0, 0.0)
     pan: tuple[float, float] = (0.0, 0.0)  # the same with the right or middle button
     scroll: float = 0.0  # wheel steps; positive is scrolling up
-    height: int = 720  # of the window, pixels
+    height: int = 720  # height of the window, pixels
     click: tuple[float, float] | None = None
 
 
@@ -200,7 +200,7 @@ def _move_camera(state: ViewerState, events: Input) -> None:
         if events.scroll:
             camera = cameras.dolly(camera, events.scroll)
     else:
-        step = axes * WALK_SPEED * state.speed * factor * events.seconds
+        step = axes * WALK_SPEED * factor * events.seconds
         if axes.any():
             camera = cameras.fly(camera, *step)
         if any(events.drag):

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.gl
 
 SIZE = (80, 60)
 CACHED = DrawSettings(cached=True, background=(0.3, 0.2, 0.1))
-STORAGES = (CACHED, replace(CACHED, cached=False), replace(CACHED, cached=False, layout="equirect"))
+STORAGES = (CACHED, replace(CACHED, cached=False))
 
 
 def enlarge_gaussians(scene):
