@@ -20,6 +20,7 @@ from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.graph import list_starts
 from pansplat.tours.route import REST_SECONDS, Route
 from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
 from pansplat_viewer.core.state import ViewerState, advance_flight, enter_scene, limit_camera
 from pansplat_viewer.core.tour_scenes import TourScenes, plan_way
@@ -432,6 +433,17 @@ class Session:
             self._stage.get_photograph(node)
         if not (state.is_zooming and self._stage.photographs.is_reading):
             advance_flight(state, seconds)
+
+    def find_place(self) -> PlaceFacts | None:
+        """What is known of the panorama that is nearest to the camera; None without any."""
+        state, facts = self._state, None if self.loaded is None else self.loaded.facts
+        position = np.asarray(state.camera.position)
+        if self.tour is not None:
+            return self.tour.find_place(position)
+        if state.graph is None or facts is None:
+            return None
+        node = int(np.linalg.norm(state.graph.positions - position, axis=1).argmin())
+        return PlaceFacts(node, facts.usual_heights[node], facts.hidden[node])
 
     def _plan_way(self, nodes: Sequence[int], rest: float = 0.0) -> Route:
         """A route from the camera through panoramas; see `plan_way`."""

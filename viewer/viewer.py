@@ -144,14 +144,14 @@ class Viewer:
     def _find_hotspots(self) -> list[Hotspot]:
         """The places of panoramas in the image, in points of the window, which may have several pixels; none while the
         camera flies."""
-        camera, fade = self.state.camera, self.stage.fade
-        size = imgui.get_io().display_size
-        points = int(size.x), int(size.y)
-        tour, moment = self.session.tour, self.state.moment
-        is_moving = moment is not None and moment.step.kind in ("flight", "zoom")
-        if tour is None or fade.parts[fade.front] != tour.part or is_moving:
+        state, fade, size = self.state, self.stage.fade, imgui.get_io().display_size
+        tour, moment, place = self.session.tour, state.moment, None
+        if moment is None or moment.step.kind not in ("flight", "zoom"):
+            place = self.session.find_place()
+        if state.graph is None or place is None or (tour is not None and fade.parts[fade.front] != tour.part):
             return []
-        return find_hotspots(tour, camera, points, self.panels.width if self.state.overlay else 0.0)
+        left = self.panels.width if state.overlay else 0.0
+        return find_hotspots(state.graph, place, state.camera, (int(size.x), int(size.y)), left)
 
     # --- frames ---
 

@@ -224,7 +224,18 @@ def user(session, ctx) -> User:
     if session.viewer.session.names != NAMES or session.viewer.session.current != 0:
         session.show(*session.entries)
     state, start = session.state, ViewerState()
-    kept = ("camera", "home", "context", "num_views", "levels", "depth_max", "message", "message_until")
+    kept = (
+        "camera",
+        "home",
+        "context",
+        "num_views",
+        "levels",
+        "depth_max",
+        "message",
+        "message_until",
+        "graph",
+        "route",
+    )
     for name in (field.name for field in fields(ViewerState) if field.name not in kept):
         setattr(state, name, getattr(start, name))
     state.camera, state.message = state.home, ""

@@ -5,19 +5,36 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from pansplat.geometry.path import wrap_angle
+from pansplat.tours.graph import TourGraph
 from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.picking import project_point
-from pansplat_viewer.core.tour_scenes import TourScenes
 
 _MIN_PIXELS = 14.0  # least radius within which a click is meant
 _BORDER, _STEP = 40.0, 56.0  # pixels: from the middle of an arrow to the border, and to the next arrow
 _ARROW = np.array(((-8.0, -12.0), (12.0, 0.0), (-8.0, 12.0)))  # corners of an arrow to the right, pixels
+
+
+class PlaceFacts(NamedTuple):
+    """What is known of a panorama, for its rings.
+
+    Attributes:
+        node: its number.
+        camera_height: over the floor, metres.
+        hidden: the panoramas whose places on the floor surfaces hide from it.
+        outlook: what is seen around it (`measure_outlook`); None if that is unknown.
+    """
+
+    node: int
+    camera_height: float
+    hidden: Sequence[int] = ()
+    outlook: Float[np.ndarray, "bin"] | None = None
 
 
 @dataclass(frozen=True)
@@ -44,22 +61,27 @@ class Hotspot:
     is_arrow: bool = False
 
 
-def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int], left: float = 0.0) -> list[Hotspot]:
+def find_hotspots(
+    tour: TourGraph,
+    facts: PlaceFacts,
+    camera: Camera,
+    size: tuple[int, int],
+    left: float = 0.0,
+) -> list[Hotspot]:
     """The panoramas that the nearest one leads to, by its edges and its own links; the nearest in the image last.
 
     Those that surfaces hide are where the links lead; without links, the nearest one stays.
 
     Args:
-        scenes: of the tour.
+        tour: the graph.
+        facts: what is known of the nearest panorama.
         camera: of the image.
         size: width and height of the image, pixels.
         left: width of what covers the image from the left, pixels.
     """
-    tour, position = scenes.tour, np.asarray(camera.position)
-    here = scenes.find_nearest(position)
-    below = scenes.camera_height * np.asarray(camera.level)[:, 1]
+    here, position, hidden = facts.node, np.asarray(camera.position), facts.hidden
+    below = facts.camera_height * np.asarray(camera.level)[:, 1]
     links = {node: link for (start, node), link in tour.links.items() if start == here}
-    hidden = scenes.hidden.get(here, [])
     flown = sorted(tour.neighbours(here), key=lambda node: np.linalg.norm(tour.positions[node] - tour.positions[here]))
     seen = [node for node in flown if node not in hidden]
     feet = {
@@ -69,13 +91,13 @@ def find_hotspots(scenes: TourScenes, camera: Camera, size: tuple[int, int], lef
     }
     for node, link in links.items():
         if (node in hidden or tour.is_fade(here, node)) and node not in feet:
-            ring = find_link_ring(tour, here, node, scenes.camera_height, scenes.outlooks.get(here))
+            ring = find_link_ring(tour, here, node, facts.camera_height, facts.outlook)
             if ring is not None:
                 feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
     found: list[Hotspot] = []
     arrows: list[Hotspot] = []
     for node, (foot, label) in sorted(feet.items(), key=lambda item: -np.linalg.norm(item[1][0] - position)):
-        is_fade, is_upright = tour.is_fade(scenes.edge[0], node), bool((foot - position - below) @ below < -1e-6)
+        is_fade, is_upright = tour.is_fade(here, node), bool((foot - position - below) @ below < -1e-6)
         hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=is_fade, is_upright=is_upright)
         if hotspot is not None and hotspot.center[0] >= left:
             found.append(hotspot)

@@ -198,7 +198,7 @@ def _with_facts(entry: SceneEntry, scene: "Scene", is_final: bool = True) -> Loa
     from pansplat.tours.facts import TourFacts
 
     facts = TourFacts(scene) if len(scene.cam2world) else None
-    _ = facts and facts.bounds  # computed in this thread
+    _ = facts and (facts.bounds, facts.usual_heights, facts.hidden)  # computed in this thread
     return LoadedScene(entry, scene, is_final, facts)
 
 

@@ -19,6 +19,7 @@ from pansplat.tours.floor import FloorOutline, choose_camera_height
 from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
 from pansplat.tours.links import link_parts
 from pansplat.tours.route import Route, plan_route
+from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry
 from pansplat_viewer.core.tracked_scene import TrackedScene
 
@@ -290,13 +291,13 @@ class TourScenes:
         part = self.tour.parts[self.tour.follow_edge(camera[:3, 3], self.edge)[0]]
         return plan_way(self.tour, camera, nodes, part=part, rest=rest, outlooks=self.outlooks)
 
-    @property
-    def camera_height(self) -> float:
-        """Height of the cameras over the floor, in the part of the camera if it is known there, metres."""
-        parts = self.tour.parts
-        here = [outline for node, outline in self.outlines.items() if parts[node] == self.part]
+    def find_place(self, position: Float[np.ndarray, "3"]) -> PlaceFacts:
+        """What is known of the nearest panorama; the height is that of cameras in its part, if one is known there."""
+        node, parts = self.find_nearest(position), self.tour.parts
+        here = [outline for other, outline in self.outlines.items() if parts[other] == self.part]
         heights = (outline.camera_height for outline in here or self.outlines.values())
-        return choose_camera_height(heights, self.tour.far)
+        height = choose_camera_height(heights, self.tour.far)
+        return PlaceFacts(node, height, self.hidden.get(node, []), self.outlooks.get(node))
 
 
 def plan_way(

@@ -12,8 +12,12 @@ from pansplat_viewer.core.hotspots import Hotspot, find_clicked, find_hotspots
 from pansplat_viewer.core.tour_scenes import TourScenes
 
 
+def find_spots(scenes: TourScenes, camera: Camera, *arguments) -> list[Hotspot]:
+    return find_hotspots(scenes.tour, scenes.find_place(np.array(camera.position)), camera, *arguments)
+
+
 def find_rings(*arguments) -> list[Hotspot]:
-    return [spot for spot in find_hotspots(*arguments) if not spot.is_arrow]
+    return [spot for spot in find_spots(*arguments) if not spot.is_arrow]
 
 
 def test_the_hotspot_of_a_link_is_where_it_meets_the_floor_or_a_wall(parted_house, load_house):
@@ -61,18 +65,18 @@ def test_a_place_outside_of_the_image_or_under_the_panel_is_an_arrow_to_where_th
         ways = set(house.neighbours(node))
         for yaw, pitch in ((0.0, 0.0), (1.6, 0.4), (3.1, -0.4), (-1.6, 0.0)):
             camera = Camera(tuple(position), yaw, pitch)
-            spots = find_hotspots(scenes, camera, (1280, 720), 290.0)
+            spots = find_spots(scenes, camera, (1280, 720), 290.0)
             assert {spot.node for spot in spots} == ways and all(290 <= spot.center[0] < 1280 for spot in spots)
     camera = Camera(tuple(house.positions[1]), 0.0)
     scenes.move(house.positions[1])
-    back, ahead = find_hotspots(scenes, replace(camera, pitch_radians=-0.4), (1280, 720), 290.0)
+    back, ahead = find_spots(scenes, replace(camera, pitch_radians=-0.4), (1280, 720), 290.0)
     assert (back.node, back.is_arrow, ahead.node, ahead.is_arrow) == (0, True, 2, False), "0 is behind the camera"
     for yaw, side in ((1.2, "left"), (-1.2, "right"), (0.0, "below")):
-        spots = find_hotspots(scenes, replace(camera, yaw_radians=yaw, pitch_radians=0.3), (1280, 720), 290.0)
+        spots = find_spots(scenes, replace(camera, yaw_radians=yaw, pitch_radians=0.3), (1280, 720), 290.0)
         (spot,) = [spot for spot in spots if spot.node == 2]
         x, y = spot.center
         assert spot.is_arrow and side == ("below" if y > 600 else "left" if x < 400 else "right")
-    assert find_clicked(find_hotspots(scenes, camera, (1280, 720)), back.center) in (0, 2)
+    assert find_clicked(find_spots(scenes, camera, (1280, 720)), back.center) in (0, 2)
 
 
 def test_a_hidden_panorama_has_its_hotspot_where_a_link_leads_or_none_while_another_one_is_seen(house, load_house):

@@ -132,7 +132,7 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
     assert scenes.list_next(None, 0.0) == [part]
     assert [step.kind for step in scenes.plan_way(house.cam2world[0].numpy(), (2,)).steps] == ["zoom", "flight"]
     camera = Camera(position=tuple(house.positions[0].tolist()))
-    (hotspot,) = find_hotspots(scenes, camera, (200, 200))
+    (hotspot,) = find_hotspots(scenes.tour, scenes.find_place(house.positions[0]), camera, (200, 200))
     assert hotspot.node == 1 and hotspot.is_fade, "a ring leads through the wall"
 
 
@@ -230,7 +230,7 @@ def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house
     assert route.walk == (3, 2, 1, 0) and "zoom" in [step.kind for step in route.steps]
     scenes.add(load_house(scenes.make_entry((3,))))
     assert scenes.list_next(route, 0.0) == [(3,), (1, 2), (0, 1)], "those of the route"
-    assert scenes.camera_height == 1.0
+    assert scenes.find_place(parted_house.positions[3]).camera_height == 1.0
     scenes.move(route.pose(1.0)[:3, 3], route.at(1.0).step.edge)
     assert scenes.views == (0, 1)
 
