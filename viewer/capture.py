@@ -15,26 +15,13 @@ from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
 from pansplat.tours.graph import TourGraph, make_graph
 from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route, plan_visits
-from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry, make_file_name
 from pansplat_viewer.core.settings import DrawSettings
-from pansplat_viewer.core.state import ViewerState, enter_scene, fit_settings
+from pansplat_viewer.core.state import fit_settings
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 
 FIELD_OF_VIEW = 75.0  # vertical field of view of films, degrees
-_ORBIT_SECONDS, _ORBIT_STILLS = 4.0, 4  # duration of the film around a scene without cameras, and its stills
-
-
-def orbit_scene(scene: Scene, fps: float, seconds: float | None) -> list[Shot]:
-    """The frames of a turn around a scene without cameras."""
-    state, height = ViewerState(), 1000
-    enter_scene(state, scene)
-    shots = []
-    for fraction in np.linspace(0, 1, max(round((seconds or _ORBIT_SECONDS) * fps), 2)).tolist():
-        camera = cameras.orbit(state.camera, (2 * height * fraction, 0.0), height)
-        shots.append(Shot(camera.cam2world, FIELD_OF_VIEW, len(shots) / fps))
-    return shots
 
 
 @contextlib.contextmanager
@@ -109,17 +96,14 @@ def write_flight(
         fps, seconds: see `list_flight`.
         show_file: called with each file that is written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     if tour is None and not len(scene.cam2world):
-        shots = orbit_scene(scene, fps, seconds)
-        visits, names = {k: k / _ORBIT_STILLS for k in range(_ORBIT_STILLS)}, ["view"] * _ORBIT_STILLS
-    else:
-        route = plan_visits(scene) if tour is None else plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
-        shots, visits = list_flight(route, fps, FIELD_OF_VIEW, seconds), route.visits
-        names = [panorama.label for panorama in (tour or make_graph(scene)).panoramas]
+        raise InputError("the scene has no input cameras to fly between; give a path to `pansplat render --path`")
+    folder.mkdir(parents=True, exist_ok=True)
+    route = plan_visits(scene) if tour is None else plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+    shots, panoramas = list_flight(route, fps, FIELD_OF_VIEW, seconds), (tour or make_graph(scene)).panoramas
     stills: dict[int, list[str]] = {}
-    for node, at in visits.items():
-        still = f"{node + 1:02d}_{make_file_name(names[node])}.png"
+    for node, at in route.visits.items():
+        still = f"{node + 1:02d}_{make_file_name(panoramas[node].label)}.png"
         stills.setdefault(math.ceil(at * (len(shots) - 1)), []).append(still)
 
     def show(number: int, color: np.ndarray) -> None:

@@ -16,8 +16,9 @@ from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.picking import project_point
 
-_MIN_PIXELS = 14.0  # least radius within which a click is meant
+_MIN_PIXELS = 14.0  # least radius of a mark within which a click leads there
 _BORDER, _STEP = 40.0, 56.0  # pixels: from the middle of an arrow to the border, and to the next arrow
+_LOWER = 100.0  # pixels from the middle of an arrow to the lower border, where messages are
 _ARROW = np.array(((-8.0, -12.0), (12.0, 0.0), (-8.0, 12.0)))  # corners of an arrow to the right, pixels
 
 
@@ -146,7 +147,7 @@ def _make_arrow(
     around = wrap_angle(math.atan2(right, forward) - camera.yaw_radians)
     across = 0.5 * width + focal * math.tan(min(max(around, -1.5), 1.5))
     if left <= across < width:
-        center = np.array((min(max(across, left + _BORDER), width - _BORDER), height - _BORDER))
+        center = np.array((min(max(across, left + _BORDER), width - _BORDER), height - _LOWER))
         turn, step = np.array(((0, -1), (1, 0))), np.array((_STEP, 0))
     else:
         sign = 1.0 if around > 0 else -1.0

@@ -13,7 +13,7 @@ Mode = Literal["joint", "view", "deferred"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Display = Literal["color", "depth", "opacity", "levels", "views"]
 
-_BLUR_STEPS = 20  # a metre, to which the movement of an exposure is rounded up, so that selections serve several frames
+_BLUR_STEPS = 20  # steps a metre; movements are rounded up to them, so that a selection serves several frames
 SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis"}
 """Displays of one number a pixel, and their colour maps."""
 

@@ -21,7 +21,7 @@ from pansplat_viewer.draw.frames import Frame
 from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, checking_memory, set_uniforms
 from pansplat_viewer.draw.splats import SortedSplats, Splats
 
-_MAX_SELECTIONS = 8
+_MAX_SELECTIONS = 8  # masks of levels and views that are kept, a byte a Gaussian each
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
 
 Viewport = tuple[int, int, int, int]  # left, bottom, width, height, pixels

@@ -15,7 +15,7 @@ from pansplat.shaders import load_shader
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
 _UNIFORM = re.compile(r"^uniform \w+ (\w+)", re.MULTILINE)
-_MAX_ERRORS = 8  # that OpenGL can report at once
+_MAX_ERRORS = 8  # largest number of errors that OpenGL reports at once
 
 
 def read_source(name: str, **defines: float | str) -> str:

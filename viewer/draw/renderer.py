@@ -41,7 +41,7 @@ def is_software(ctx: moderngl.Context) -> bool:
     return any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
 
 
-_COLOR_MAP_UNIT = 8  # texture unit, after those of the layers
+_COLOR_MAP_UNIT = 8  # the texture unit of the colour map; layers have those before it
 
 
 class SplatRenderer:

@@ -24,7 +24,7 @@ from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
 
 SIZE = 210  # side of the plan, pixels at a DPI scale of 1
-_CLICK_PIXELS = 12.0  # from a panorama, within which a click leads there, at a DPI scale of 1
+_CLICK_PIXELS = 12.0  # distance from a panorama within which a click leads there, at a DPI scale of 1
 _VIEW_LENGTH = 1.0  # length of the lines that show the field of view, metres
 _DASH = 5.0  # length of a dash of an outline, pixels at a DPI scale of 1
 

@@ -13,7 +13,7 @@ from pansplat_viewer.core.state import ViewerState
 from pansplat_viewer.draw.color_maps import get_table
 
 PANEL_WIDTH = 290.0  # width of the main panel before a user drags it, pixels at a DPI scale of 1
-MARGIN = 10.0  # from the border of the window, pixels
+MARGIN = 10.0  # distance of overlays from the border of the window, pixels
 FIXED = (  # flags of a window that is placed anew in each frame
     imgui.WindowFlags_.no_move.value | imgui.WindowFlags_.no_resize.value | imgui.WindowFlags_.no_saved_settings.value
 )

@@ -16,9 +16,9 @@ from pansplat.inputs.panorama_sets import Note, Panorama
 from pansplat.inputs.photographs import read_notes
 from pansplat.tours.route import STOP_REACH
 
-MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
-_MAX_TEXTURES = 4  # 25 MB each
-_VIEW_HEIGHT = 64  # pixels, of a panorama in which a view is chosen
+MAX_HEIGHT = 2048  # most rows of a texture; sharper than the image at fields of view above 65 degrees on 720 rows
+_MAX_TEXTURES = 4  # textures that are kept, 25 MB each
+_VIEW_HEIGHT = 64  # rows of a panorama in which a view is chosen
 
 
 class PhotographTextures:

@@ -29,7 +29,7 @@ from pansplat_viewer.ui.presenter import PhotographLayer, PosedPhotograph, Prese
 
 DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
 _EXPOSURE_SECONDS = 1 / 30  # longest exposure of a frame of a flight, by which its Gaussians blur
-_JUMP = 1.0  # metres between two frames, which no flight flies
+_JUMP = 1.0  # distance between two frames that only a jump has, metres
 
 
 class Stage:

@@ -19,8 +19,8 @@ from pansplat_viewer.draw.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
-_IDLE_SECONDS = 0.1  # between frames when nothing moves; so that a prediction gets the CPU
-_PENDING_SECONDS = 0.05  # between frames while an image is drawn in the background; so that it gets the CPU
+_IDLE_SECONDS = 0.1  # time between frames when nothing moves; so that a prediction gets the CPU
+_PENDING_SECONDS = 0.05  # time between frames while an image is drawn in the background; so that it gets the CPU
 
 
 class NoWindowError(Exception):
