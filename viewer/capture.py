@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pansplat.errors import InputError
 from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image

@@ -16,7 +16,7 @@ from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.picking import project_point
 
-_MIN_PIXELS = 14.0  # least radius of a mark within which a click leads there
+_MIN_PIXELS, _MAX_PIXELS = 14.0, 64.0  # least radius within which a click is meant, and largest one of a ring
 _BORDER, _STEP = 40.0, 56.0  # pixels: from the middle of an arrow to the border, and to the next arrow
 _LOWER = 100.0  # pixels from the middle of an arrow to the lower border, where messages are
 _ARROW = np.array(((-8.0, -12.0), (12.0, 0.0), (-8.0, 12.0)))  # corners of an arrow to the right, pixels
@@ -127,8 +127,11 @@ def _make_hotspot(
     ring = [project_point(camera, tuple(corner), size) for corner in circle]
     if center is None or None in ring or not (0 <= center[0] < size[0] and 0 <= center[1] < size[1]):
         return None
-    radius = max(np.ptp([corner[0] for corner in ring]) / 2, _MIN_PIXELS)
-    return Hotspot(node, label, center, float(radius), tuple(ring), is_fade)
+    radius = float(np.ptp([corner[0] for corner in ring])) / 2
+    shrunk = np.array(center) + min(_MAX_PIXELS / max(radius, 1e-9), 1.0) * (np.array(ring) - center)
+    return Hotspot(
+        node, label, center, min(max(radius, _MIN_PIXELS), _MAX_PIXELS), tuple(map(tuple, shrunk.tolist())), is_fade
+    )
 
 
 def _make_arrow(

@@ -41,6 +41,9 @@ def test_the_hotspot_of_a_link_is_where_it_meets_the_floor_or_a_wall(parted_hous
     scenes.outlooks[3] = np.full(BINS, 2.0)
     (hotspot,) = find_rings(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
     assert np.ptp(hotspot.ring, axis=0)[0] == pytest.approx(1.5 * width, rel=0.05), "a nearer wall"
+    scenes.outlooks[3] = np.full(BINS, 0.6)
+    (hotspot,) = find_rings(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (1280, 720))
+    assert np.ptp(hotspot.ring, axis=0)[0] == pytest.approx(128, abs=1) and hotspot.radius == 64, "no ring is larger"
 
 
 def test_a_hotspot_is_below_its_panorama_and_a_click_finds_the_nearest(house, load_house):
