@@ -450,4 +450,5 @@ class Session:
         if self.tour is not None:
             return self.tour.plan_way(pose, nodes, rest=rest)
         assert graph is not None
+        graph = graph if self.loaded is not None else replace(graph, poor=tuple(graph.overlaps))  # only photographs
         return plan_way(graph, pose, nodes, rest=rest)

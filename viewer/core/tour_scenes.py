@@ -287,9 +287,11 @@ class TourScenes:
         return self.make_entry(views)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], nodes: Sequence[int] = (), *, rest: float = 0.0) -> Route:
-        """`plan_way` in the part of a camera, which may be that after a jump."""
-        part = self.tour.parts[self.tour.follow_edge(camera[:3, 3], self.edge)[0]]
-        return plan_way(self.tour, camera, nodes, part=part, rest=rest, outlooks=self.outlooks)
+        """`plan_way` in the part of a camera, which may be that after a jump; it zooms along edges without a scene."""
+        part, loaded = self.tour.parts[self.tour.follow_edge(camera[:3, 3], self.edge)[0]], set(self.loaded)
+        missing = [edge for edge, views in self._views.items() if views not in loaded]
+        tour = replace(self.tour, poor=tuple({*self.tour.poor, *missing}))
+        return plan_way(tour, camera, nodes, part=part, rest=rest, outlooks=self.outlooks)
 
     def find_place(self, position: Float[np.ndarray, "3"]) -> PlaceFacts:
         """What is known of the nearest panorama; the height is that of cameras in its part, if one is known there."""

@@ -176,7 +176,13 @@ def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_again(
     assert scenes.choose_request(scenes.list_next(None, 0.0), None).views == scenes.views
 
 
-def test_a_way_begins_at_the_camera_and_after_a_jump_at_its_edge(scenes):
+def test_a_way_begins_at_the_camera_and_after_a_jump_at_its_edge_and_zooms_along_edges_without_a_scene(
+    scenes, load_house
+):
+    kinds = [step.kind for step in scenes.plan_way(scenes.tour.cam2world[0].numpy(), (2,)).steps]
+    assert "flight" in kinds and "zoom" in kinds, "only the scene of the first edge is there"
+    for views in ((1, 2), (2, 3)):
+        scenes.add(load_house(scenes.make_entry(views)))
     looking = Camera(position=(0.1, 0.0, 0.5), yaw_radians=0.4, pitch_radians=0.2)
     route = scenes.plan_way(looking.cam2world, (3,))
     assert np.allclose(route.pose(0), looking.cam2world, atol=1e-3)
