@@ -23,7 +23,7 @@ from pansplat_viewer.core.placing_by_hand import PlanView
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
 
-SIZE = 210  # side of the plan, pixels at a DPI scale of 1
+SIZE = 210  # longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0  # distance from a panorama within which a click leads there, at a DPI scale of 1
 _VIEW_LENGTH = 1.0  # length of the lines that show the field of view, metres
 _DASH = 5.0  # length of a dash of an outline, pixels at a DPI scale of 1
@@ -85,10 +85,12 @@ class Minimap:
         floors = {n: self._move(n, outline.corners) for n, outline in scenes.outlines.items() if n not in dots}
         cameras = tour.positions @ tour.level_axes[:, (0, 2)]
         nodes = np.stack([self._move(node, place) for node, place in enumerate(cameras)])
-        corner, size = imgui.get_cursor_screen_pos(), (SIZE * scale, SIZE * scale)
-        view = PlanView.of_points(np.concatenate([nodes, *floors.values()]), size, (corner.x, corner.y))
+        corner, points = imgui.get_cursor_screen_pos(), np.concatenate([nodes, *floors.values()])
+        extent = np.ptp(points, axis=0) + 1.0  # metres
+        width, height = (SIZE * scale * extent / extent.max()).tolist()
+        view = PlanView.of_points(points, (width, height), (corner.x, corner.y))
         to_pixels = view.to_pixels
-        imgui.dummy(size)
+        imgui.dummy((width, height))
         hovered = imgui.is_item_hovered()
         for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
             shown = [node for node in floors if (node in others) == is_other and node not in self._drawn]

@@ -1,7 +1,6 @@
 """The scenes of a tour are chosen, requested, kept and faded; the film has no jumps."""
 
 import contextlib
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -301,29 +300,6 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
     steps = np.abs(np.diff(frames, axis=0)).mean((1, 2, 3))
     change = np.abs(frames[0].mean((0, 1)) - frames[-1].mean((0, 1))).mean()
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
-
-
-def test_a_change_of_scenes_changes_the_picture_no_more_than_a_flight_along_an_edge(house, load_house, open_tour_film):
-    scenes = TourScenes(house, max_views=64)
-    loaded = load_house(scenes.make_entry((0, 1, 2, 3)))
-    brightness = torch.tensor((1.0, 0.3, 0.8, 0.1))[loaded.scene.gaussians.views]
-    gaussians = replace(loaded.scene.gaussians, harmonics=loaded.scene.gaussians.harmonics * brightness[:, None, None])
-    scenes.add(replace(loaded, scene=replace(loaded.scene, gaussians=gaussians)))
-    film = open_tour_film(scenes, pytest.fail, (48, 27))
-    route = plan_route(house, [0, 1, 2, 3])
-    times = np.arange(0, route.seconds, 1 / 20)  # steps of 5 cm at most
-    shown, edges = [], []
-    for seconds in times:
-        moment = route.at(seconds / route.seconds)
-        shown.append(film.draw(Shot.of_moment(moment, 75.0, seconds)))
-        edges.append(scenes.edge)
-    turning = np.array([route.at(seconds / route.seconds).step.kind == "turn" for seconds in times])
-    steps = np.abs(np.diff(shown, axis=0)).mean((1, 2, 3)) * ~(turning[:-1] | turning[1:])
-    changes = [k for k, (a, b) in enumerate(itertools.pairwise(edges)) if a != b]
-    is_fading = np.any([(times[:-1] >= times[k]) & (times[:-1] < times[k] + FADE_SECONDS) for k in changes], axis=0)
-    assert len(changes) == 2 and 10 < is_fading.sum() < len(steps) - 10
-    assert steps[changes].max() <= steps[~is_fading].max(), "no jump when an edge ends"
-    assert steps[is_fading].max() <= steps[~is_fading].max(), "nor while the scenes fade"
 
 
 @pytest.mark.gl
