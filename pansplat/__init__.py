@@ -13,7 +13,7 @@ choose_kernel_cache(os.path.dirname(__file__), os.environ)
 # operation of half a millisecond on two threads takes six to nineteen.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 # Resolved at first use: `import pansplat` and `pansplat --help` must not import torch.
 _PUBLIC = {
