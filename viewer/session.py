@@ -1,6 +1,6 @@
 """The scenes of the window: those to choose from, which one is shown, which one comes next, and those of a tour.
 
-`Session` follows the loader: each scene has a `TrackedScene`. The stage draws them.
+`Session` follows the loader; the stage draws the scenes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
 from pansplat_viewer.core.state import ViewerState, advance_flight, enter_scene, limit_camera
 from pansplat_viewer.core.tour_scenes import TourScenes, plan_way
-from pansplat_viewer.core.tracked_scene import TrackedScene
 from pansplat_viewer.ui.photograph_textures import find_open_view
 from pansplat_viewer.ui.stage import Stage
 
@@ -37,8 +36,7 @@ class Session:
         entries: to choose from.
         current: number of the one that is shown or loaded; -1 if there is none.
         path: where they were found; None if they are only loaded again.
-        shown: the scene that is shown, of a tour the first one; None before the first one.
-        coming: the scene that replaces it when it is predicted and prepared; None if there is none.
+        loaded: the scene that is shown, of a tour the first one; None before the first one.
         tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
     """
 
@@ -74,8 +72,8 @@ class Session:
         self._kept: tuple[list[SceneEntry], int, Path | None] | None = (
             None  # what `entries`, `current` and `path` were for the scene that is shown
         )
-        self.shown: TrackedScene | None = None
-        self.coming: TrackedScene | None = None
+        self.loaded: LoadedScene | None = None
+        self._waiting: LoadedScene | None = None  # it is shown once it is converted for the renderer
         self.tour: TourScenes | None = None
 
     # --- what the panels read ---
@@ -94,17 +92,6 @@ class Session:
     def entry(self) -> SceneEntry | None:
         """The entry that is shown or loaded."""
         return self.entries[self.current] if 0 <= self.current < len(self.entries) else None
-
-    @property
-    def loaded(self) -> LoadedScene | None:
-        """The scene that is shown."""
-        return None if self.shown is None else self.shown.loaded
-
-    @property
-    def _waiting(self) -> LoadedScene | None:
-        """The loaded scene of `coming`, which is shown once it is converted for the renderer."""
-        coming = self.coming
-        return coming.loaded if coming is not None and coming.is_known else None
 
     @property
     def is_busy(self) -> bool:
@@ -142,7 +129,7 @@ class Session:
     def _loads_for_tour(self) -> bool:
         """Whether the loader works for the tour that is shown, and not for a scene that the user has chosen."""
         entry = self.loader.entry
-        if self.tour is None or self.shown is None:
+        if self.tour is None or self.loaded is None:
             return False
         return self._waiting is None if entry is None else self.tour.is_of(entry)
 
@@ -168,12 +155,9 @@ class Session:
         """
         self.entries, self.current, self.path = entries, index, path
         self._listed(path)
-        if self.shown is None:
+        if self.loaded is None:
             self._preview(entries[index])
-        else:
-            self.shown.cancel()
-        self.coming = TrackedScene(entries[index])
-        self.coming.request()
+        self._waiting = None
         self.loader.request(entries[index])
 
     def expect(self, entries: list[SceneEntry], path: Path, name: str | None) -> None:
@@ -188,7 +172,7 @@ class Session:
         self._show_unplaced(entries)
 
     def _show_unplaced(self, entries: list[SceneEntry]) -> None:
-        if self.shown is None and entries:
+        if self.loaded is None and entries:
             self.entries, self.current, self.path = entries, 0, None
             self._preview(entries[0])
 
@@ -210,14 +194,12 @@ class Session:
         if not self.loader.cancel_search():
             self.loader.cancel()
             self._stage.preparer.stop()
-            self.coming, self.current = None, -1
+            self._waiting, self.current = None, -1
             self._restore()
 
     def cancel_refinement(self) -> None:
         """End the refinement of the scene that is shown."""
         self.loader.cancel()
-        if self.shown is not None:
-            self.shown.cancel()
 
     def dismiss(self) -> None:
         """Go on with the scene that is shown after an error."""
@@ -233,9 +215,9 @@ class Session:
 
     def poll(self) -> None:
         """Show the scene, the entries or the error of a finished load or search."""
-        loader, coming, waiting = self.loader, self.coming, self._waiting
-        if coming is not None and waiting is not None and self._stage.preparer.is_ready(waiting.scene):
-            self._replace(coming, waiting)
+        loader, waiting = self.loader, self._waiting
+        if waiting is not None and self._stage.preparer.is_ready(waiting.scene):
+            self._replace(waiting)
         requested = loader.entry
         result = loader.poll() if self._waiting is None else None
         if isinstance(result, list) and loader.is_searching:
@@ -250,60 +232,42 @@ class Session:
         elif result is not None:
             known = isinstance(result, (InputError, OSError))  # else a defect, or out of memory
             self._show_error(str(result) if known else f"{type(result).__name__}: {result}")
-            if requested is not None and loader.entry is None:  # else the search
-                self._fail(requested)
+            if requested is not None and loader.entry is None and self.tour is not None and self.tour.is_of(requested):
+                self.tour.fail(requested.views)
             self._restore()
 
     def _receive(self, result: LoadedScene) -> None:
         """Take a prediction or a refined scene of the loader."""
-        shown, coming = self.shown, self.coming
-        if shown is not None and self.tour is not None and self.tour.is_of(result.entry):
+        if self.loaded is not None and self.tour is not None and self.tour.is_of(result.entry):
             self.tour.add(result)
-            return
-        if shown is not None and shown.state == "refining" and self.loaded and self.loaded.entry is result.entry:
-            shown.receive(result)
-            return
-        if coming is None or coming.state != "predicting":
-            coming = self.coming = TrackedScene(result.entry)
-            coming.request()
-        coming.receive(result)
-        if self._stage.preparer.is_ready(result.scene):
-            self._replace(coming, result)
+        elif self.loaded is not None and self.loaded.entry is result.entry and not self.loaded.is_final:
+            self.loaded = result
+        elif self._stage.preparer.is_ready(result.scene):
+            self._replace(result)
+        else:
+            self._waiting = result
 
-    def _fail(self, requested: SceneEntry) -> None:
-        """Mark an entry as failed, which the loader could not load."""
-        if self.tour is not None and self.tour.is_of(requested):
-            self.tour.fail(requested.views)
-        elif self.coming is not None and self.coming.entry is requested:
-            self.coming.fail()
-        elif self.shown is not None and self.shown.entry is requested:
-            self.shown.cancel()
-
-    def _replace(self, tracked: TrackedScene, loaded: LoadedScene) -> None:
+    def _replace(self, loaded: LoadedScene) -> None:
         """Show a scene; if it does not fit into memory, keep the one before."""
-        self.coming = None
+        self._waiting = None
         if self._stage.upload(self._stage.slots[0], loaded.scene, loaded.entry.name):
             self._stage.has_failed = False
-            self._enter(tracked, loaded)
-        else:
-            tracked.fail()
+            self._enter(loaded)
 
     def exchange(self) -> None:
         """Show the refined scene in place of its prediction, while the camera stands still."""
-        stage, tracked, loaded = self._stage, self.shown, self.loaded
-        if tracked is None or loaded is None or tracked.state != "refined" or self._waiting is not None:
+        stage, loaded = self._stage, self.loaded
+        if loaded is None or self.tour is not None or self._waiting is not None or loaded.scene is stage.slot.scene:
             return
-        if loaded.scene is stage.slot.scene or not stage.preparer.is_ready(loaded.scene):
-            return
-        if not stage.upload(stage.slot, loaded.scene, loaded.entry.name):
-            tracked.fail()
+        if stage.preparer.is_ready(loaded.scene) and not stage.upload(stage.slot, loaded.scene, loaded.entry.name):
+            self.loaded = replace(loaded, scene=stage.slot.scene)  # the prediction stays
 
-    def _enter(self, tracked: TrackedScene, loaded: LoadedScene) -> None:
+    def _enter(self, loaded: LoadedScene) -> None:
         """Show a scene that is uploaded, and go to its start."""
         stage, state, entry = self._stage, self._state, loaded.entry
-        photograph = stage.photograph if self.shown is None else None
-        remaining = self._list_remaining() if self.shown is None else ()
-        self.shown, self.tour = tracked, None
+        photograph = stage.photograph if self.loaded is None else None
+        remaining = self._list_remaining() if self.loaded is None else ()
+        self.loaded, self.tour = loaded, None
         self._kept = self.entries, self.current, self.path
         stage.clear()
         stage.photographs.open(entry.panoramas)
@@ -410,7 +374,7 @@ class Session:
         if loaded is not None and stage.fade_to_scene(loaded, tour.part, can_wait=self._waiting is None):
             return
         shows_scene = stage.photograph is None and stage.fade.parts[stage.fade.front] == tour.part
-        if self.shown is None or not (shows_scene and tour.is_inside(position, stage.scene_views)):
+        if self.loaded is None or not (shows_scene and tour.is_inside(position, stage.scene_views)):
             for end in tour.edge:  # that of the other end is read before it is needed
                 stage.get_photograph(end)
             stage.fade_to_photograph(tour.find_nearest(position), tour.part)

@@ -759,7 +759,7 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(tour_app, l
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    next(tracked for tracked in app.session.tour._predictions.values() if tracked.loaded).drop()  # one is missing
+    next(each for each in app.session.tour._predictions.values() if each.loaded).drop()  # one is missing
     is_ready = app.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
         app.viewer.stage.preparer,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -21,10 +21,30 @@ from pansplat.tours.links import link_parts
 from pansplat.tours.route import Route, plan_route
 from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry
-from pansplat_viewer.core.tracked_scene import TrackedScene
 
 _MEMORY = 2 << 30  # bytes that the scenes of a tour may take; two predictions are kept in any case
 _NEXT_SCENES = 3  # number of the next predictions of a way, which are dropped last
+
+
+@dataclass
+class _Prediction:
+    """A prediction of some panoramas of a tour.
+
+    Attributes:
+        loaded: None before it is predicted, and while it is not in memory.
+        is_known: whether it has been predicted.
+        has_failed: whether it cannot be predicted or refined.
+    """
+
+    loaded: LoadedScene | None = None
+    is_known: bool = False
+    has_failed: bool = False
+
+    def drop(self) -> LoadedScene:
+        """Take the scene out of memory, and return it."""
+        assert self.loaded is not None
+        loaded, self.loaded = self.loaded, None
+        return loaded
 
 
 class TourScenes:
@@ -67,15 +87,13 @@ class TourScenes:
             for views in self._views.values()
         }
         predictions = dict.fromkeys(source for sources in self._sources.values() for source in sources)
-        # Predictions, the least recently used one first.
-        self._predictions = OrderedDict(
-            (views, TrackedScene(SceneEntry("", tour=tour, views=views))) for views in predictions
-        )
+        # The least recently used one is the first.
+        self._predictions = OrderedDict((views, _Prediction()) for views in predictions)
         self._selected: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # from predictions, and the first one
         self._following: tuple[Edge, list[ViewNumbers]] | None = None
         if merged is not None:
             entry = SceneEntry(tour.name, tour=tour, views=everything)
-            self._predictions.setdefault(everything, TrackedScene(entry)).receive(LoadedScene(entry, merged))
+            self._predictions[everything] = _Prediction(LoadedScene(entry, merged), True)
 
     @staticmethod
     def start(loaded: LoadedScene) -> TourScenes:
@@ -141,7 +159,8 @@ class TourScenes:
         if views not in self._predictions:
             self._selected[views] = loaded
             return
-        self._predictions[views].receive(loaded)
+        prediction = self._predictions[views]
+        prediction.loaded, prediction.is_known = loaded, True
         self._predictions.move_to_end(views)
         for scene in [scene for scene in self._selected if views in self._sources[scene] and self._has_sources(scene)]:
             del self._selected[scene]
@@ -169,7 +188,7 @@ class TourScenes:
 
     def _drop(self, newest: ViewNumbers) -> None:
         """Drop what was not used for the longest time, until the memory is not exceeded."""
-        kept = [views for views, tracked in self._predictions.items() if tracked.loaded is not None]
+        kept = [views for views, prediction in self._predictions.items() if prediction.loaded is not None]
         every = (*self._selected.values(), *filter(None, map(self._find, kept)))
         total = sum(measure_bytes(each.scene) for each in every)
         needed = {newest, self.views, *self._sources[self.views]}
@@ -184,7 +203,7 @@ class TourScenes:
     def fail(self, views: ViewNumbers) -> None:
         """Do not request a prediction again, because it could not be loaded or refined."""
         if views in self._predictions:
-            self._predictions[views].fail()
+            self._predictions[views].has_failed = True
 
     def get(self, views: ViewNumbers) -> LoadedScene | None:
         """The scene of an edge if it is in memory; it becomes the most recently used."""
@@ -262,28 +281,19 @@ class TourScenes:
         Predictions come before refinements. A refinement ends if a prediction that the camera needs is missing; a
         prediction is finished, so that none is lost. One that was dropped from memory is read again when it is needed.
         """
-        predictions = {
-            views: self._predictions[views] for views in wanted if self._predictions[views].state != "failed"
-        }
+        predictions = {views: self._predictions[views] for views in wanted if not self._predictions[views].has_failed}
         for views in reversed(list(predictions)[: 1 + _NEXT_SCENES]):
             self._predictions.move_to_end(views)
-        missing = [views for views, tracked in predictions.items() if tracked.loaded is None]
+        missing = [views for views, each in predictions.items() if each.loaded is None]
         missing = [views for views in missing if not predictions[views].is_known or views in self.missing]
         if current is not None and (current.views in predictions or not missing):
             is_refined = self._find(current.views) is not None
             if not missing or missing[0] not in self.missing or not is_refined:
                 return None
-        unrefined = (
-            views
-            for views, tracked in predictions.items()
-            if tracked.loaded is not None and not tracked.loaded.is_final
-        )
+        unrefined = (views for views, each in predictions.items() if each.loaded and not each.loaded.is_final)
         views = missing[0] if missing else next(unrefined, None)
         if views is None:
             return None
-        if current is not None and current.views in self._predictions:
-            self._predictions[current.views].cancel()
-        self._predictions[views].request()
         return self.make_entry(views)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], nodes: Sequence[int] = (), *, rest: float = 0.0) -> Route:
