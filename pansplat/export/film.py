@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,17 +27,17 @@ from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
-from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
+from pansplat.tours.route import STOP_REACH, Moment, Route, find_offset
 
+_FADE_METRES = 0.2  # way along which a photograph fades beside a camera path: 0.2 s at a metre a second
 _HEIGHTS = (512, 1024, 2048, 4096)  # rows of photographs in memory; the least that is as dense as the frame is read
 
 Image = Float[np.ndarray, "height width 3"]
 Pose = Float[np.ndarray, "4 4"]
-DrawnPose = tuple[Pose, float, Callable[[], Image]]  # a pose, its weight, and what draws it
 
 
 class FilmPhotographs:
-    """Photographs over the frames of a film within `STOP_REACH` of their panoramas; they fade for `STOP_SECONDS`.
+    """Photographs over the frames of a film near their panoramas.
 
     What masks hide is not shown: the image of the Gaussians stays there.
     """
@@ -58,8 +57,6 @@ class FilmPhotographs:
         """
         self._poses = cam2world[: len(photographs)].double().cpu()
         self._gains = torch.tensor(gains)[:, :, None, None] if gains else None
-        self._weights: dict[int, float] = {}  # weights of the photographs near the poses of the last frame
-        self._seconds = 0.0  # time of the last frame
 
         @functools.lru_cache(maxsize=2)
         def load(index: int, height: int) -> Float[Tensor, "4 height width"]:
@@ -77,28 +74,13 @@ class FilmPhotographs:
         gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
         return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
 
-    def mix(self, frame: Sequence[DrawnPose], plane: ImagePlane, seconds: float) -> Image:
-        """The image of a frame, with the photographs of the panoramas at which its poses stand.
-
-        A photograph is shown at once in the first frame that is near its panorama after a cut.
-
-        Args:
-            frame: what is mixed.
-            plane: size and field of view.
-            seconds: time of the frame in the film.
-        """
-        step, self._seconds = abs(seconds - self._seconds) / STOP_SECONDS, seconds
-        last, self._weights = self._weights, {}
-        mixed: Any = 0.0
-        for pose, share, draw in frame:
-            distances = np.linalg.norm(self._poses[:, :3, 3].numpy() - pose[:3, 3], axis=1)
-            index, nearest = int(distances.argmin()) if len(distances) else -1, distances.min(initial=np.inf)
-            weight = float(nearest <= STOP_REACH)
-            if index in last:
-                weight = last[index] + min(max(weight - last[index], -step), step)
-            self._weights[index] = weight
-            mixed += share * self.cover(index, weight, pose, plane, draw)
-        return mixed
+    def find_stop(self, pose: Pose) -> tuple[int | None, float]:
+        """The photograph at whose panorama a camera is, and its weight, which falls beyond `STOP_REACH`."""
+        distances = np.linalg.norm(self._poses[:, :3, 3].numpy() - pose[:3, 3], axis=1)
+        if not len(distances):
+            return None, 0.0
+        nearest = int(distances.argmin())
+        return nearest, min(max(1 - (float(distances[nearest]) - STOP_REACH) / _FADE_METRES, 0.0), 1.0)
 
     def cover(
         self, index: int | None, weight: float, pose: Pose, plane: ImagePlane, draw: Callable[[], Image]
@@ -239,22 +221,17 @@ class Film:
         weight = fade.compute_weight(shot.seconds)
 
         drawn = [
-            (pose, share, functools.partial(self._draw, slot, scene, replace(shot, pose=pose)))
+            (share, functools.partial(self._draw, slot, scene, replace(shot, pose=pose)))
             for slot, share in ((1 - fade.front, 1 - weight), (fade.front, weight))
             if isinstance(scene := fade.contents[slot], Scene) and (pose := fade.poses[slot]) is not None
             if share > 0 or slot == fade.front
         ]
+        photograph = photographs.find_stop(shot.pose) if moment is None else (moment.photograph, moment.weight)
         plane = self._make_plane(shot)
-        if moment is None:
-            return photographs.mix(drawn, plane, shot.seconds)
         image = photographs.cover(
-            moment.photograph,
-            moment.weight,
-            shot.pose,
-            plane,
-            lambda: np.sum([share * draw() for _, share, draw in drawn], axis=0),
+            *photograph, shot.pose, plane, lambda: np.sum([share * draw() for share, draw in drawn], axis=0)
         )
-        if goal is None:
+        if goal is None or moment is None:
             return image
         arrived = photographs.cover(
             moment.step.nodes[1],

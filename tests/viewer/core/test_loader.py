@@ -176,13 +176,6 @@ def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_a
     assert len(set(early.tour.parts)) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "folder"), [("a/b c", "a_b_c"), ("../x", "x"), ("...", "scene"), ("Küche 1", "Küche_1")]
-)
-def test_folder_name_is_a_single_valid_name(name, folder):
-    assert SceneEntry(name).folder_name == folder
-
-
 def test_a_prediction_has_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):
     options = PredictOptions("sweep", height=256, cache=False, refine_steps=3)
 
