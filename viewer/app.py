@@ -62,8 +62,6 @@ class Options:
     renderer: RendererChoice = "auto"
     """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is
     software."""
-    at: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    """Start position on the way through the panoramas, 0 to 1."""
     device: Device = "auto"
     """As that of `pansplat predict`; OpenGL draws on its own card (--renderer)."""
     verbose: bool = False
@@ -179,7 +177,6 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
             loader,
             find=find,
             state=state,
-            at=options.at,
             dpi_scale=window.dpi_scale,
             renderer=options.renderer,
             recent=find_file(),

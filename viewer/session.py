@@ -47,7 +47,6 @@ class Session:
         loader: SceneLoader,
         find: Find,
         *,
-        at: float,
         show_error: Callable[[str], None],
         listed: Callable[[Path | None], None],
     ) -> None:
@@ -58,12 +57,10 @@ class Session:
             stage: draws the image.
             loader: finds and loads entries.
             find: returns the entries of a path; called in a worker thread.
-            at: fraction of the flight at which a scene is entered.
             show_error: shows a message.
             listed: called when other entries are listed, with the path at which they were found.
         """
         self._state, self._stage, self.loader, self._find = state, stage, loader, find
-        self._at = at
         self._show_error, self._listed = show_error, listed
         self.entries: list[SceneEntry] = []
         self.current = -1
@@ -272,7 +269,7 @@ class Session:
         stage.clear()
         stage.photographs.open(entry.panoramas)
         state.show_message(f"{entry.name}   (H shows the keys)")
-        enter_scene(state, loaded.scene, entry.tour, entry.start, at=self._at)
+        enter_scene(state, loaded.scene, entry.tour, entry.start)
         if entry.tour is None:
             state.graph = state.graph if loaded.facts is None else loaded.facts.bounds
             limit_camera(state, state.home)
@@ -304,7 +301,7 @@ class Session:
         poses = torch.stack([panorama.cam2world for panorama in panoramas])
         starts, frame = list_starts(panoramas), panoramas[0].frame
         scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=starts, frame=frame)
-        enter_scene(self._state, scene, entry.tour, at=self._at)
+        enter_scene(self._state, scene, entry.tour)
         self.tour = None if entry.tour is None else TourScenes(entry.tour)
         self._keep_view(view, entry.panoramas)
         nearest = photographs.find_nearest(np.asarray(self._state.camera.position))

@@ -72,7 +72,6 @@ class Viewer:
         find: Find,
         state: ViewerState | None = None,
         folder: Path = Path("renders"),
-        at: float = 0.0,
         dpi_scale: float = 1.0,
         renderer: RendererChoice = "auto",
         recent: Path | None = None,
@@ -86,7 +85,6 @@ class Viewer:
             find: returns the entries of a path that a user opens or drops; called in a worker thread.
             state: the initial state.
             folder: screenshots are written to its subfolder with the entry's name.
-            at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
             renderer: draws the image; `auto` is `cpu` where OpenGL is software.
             recent: file of the paths that were opened; None remembers none.
@@ -101,7 +99,6 @@ class Viewer:
             self.stage,
             loader,
             find,
-            at=at,
             show_error=self.show_error,
             listed=self._note_listed,
         )

@@ -51,7 +51,6 @@ SMALL = Pacing(min_size=(64, 64), settle_seconds=0.02, turn_ms=1000 / 60, waits_
 # Widgets that must change the image, and the settings that give some of them something to change.
 IMAGE_WIDGETS = (
     "joint", "deferred", "view 0", "view 1", "0##level", "1##level", "2##level", "3##level",
-    "##flight",
 )  # fmt: skip
 INITIAL_SETTINGS = {
     **{label: {"mode": "joint"} for label in ("deferred", "view 0", "view 1")},
@@ -124,7 +123,7 @@ class User:
         self.draw_frames(1)
         left, top, right, bottom = self.panels.widgets.items[label]
         x = (left + right) / 2
-        if right - left > 60 and label not in ("path", "pair", "##flight"):
+        if right - left > 60 and label not in ("path", "pair"):
             x = left + 10
         self.click_at(x, (top + bottom) / 2)
 

@@ -83,9 +83,7 @@ class ViewerState:
         self.message, self.message_until = message, self.now + 4
 
 
-def enter_scene(
-    state: ViewerState, scene: Scene, tour: TourGraph | None = None, start: int | None = None, *, at: float = 0.0
-) -> None:
+def enter_scene(state: ViewerState, scene: Scene, tour: TourGraph | None = None, start: int | None = None) -> None:
     """Start in a scene; settings that it does not support are reset.
 
     In a scene of the same cameras as the one before, the camera stays where it is.
@@ -95,7 +93,6 @@ def enter_scene(
         scene: that is shown, of a tour the first one.
         tour: None for another scene, in which cameras may fly between any two panoramas.
         start: the panorama of the tour at which the way through it starts; None to choose one.
-        at: fraction of the way.
     """
     graph = tour or (make_graph(scene).with_all_edges() if len(scene.cam2world) else None)
     context = np.zeros((0, 4, 4)) if graph is None else graph.cam2world.numpy()
@@ -103,13 +100,13 @@ def enter_scene(
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR if tour is None else NEAR_OF_FAR * tour.far)
     state.graph, state.is_tour, state.context, state.target, state.route = graph, tour is not None, context, None, None
-    state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
+    state.playing, state.flight, state.points = False, 0.0, []
     if graph is None:
         level, pose = level_axes(scene.cam2world), _choose_outside_pose(scene)
     else:
         walk = range(len(graph)) if tour is None else graph.plan_walk(start)
         state.route, level = plan_route(graph, walk), graph.level_axes
-        pose = state.route.pose(state.flight)
+        pose = state.route.pose(0.0)
     levelled = replace(state.camera, level=tuple(tuple(row) for row in level.tolist()))
     state.home = move_to_pose(levelled, pose)
     state.camera = before or state.home
@@ -173,13 +170,6 @@ def go_home(state: ViewerState) -> None:
     state.playing, state.camera = False, state.home
 
 
-def fly_to(state: ViewerState, fraction: float) -> None:
-    """Move the camera to a fraction of the route."""
-    state.flight = min(max(fraction, 0.0), 1.0)
-    if state.route is not None:
-        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
-
-
 def toggle_play(state: ViewerState) -> None:
     """Start or stop the flight; at its end, start it from the beginning."""
     if state.route is None:
@@ -192,7 +182,8 @@ def toggle_play(state: ViewerState) -> None:
 def advance_flight(state: ViewerState, seconds: float) -> None:
     """Move along the flight if it is playing, and stop at its end."""
     if state.playing and state.route is not None:
-        fly_to(state, state.flight + seconds / state.route.seconds)
+        state.flight = min(state.flight + seconds / state.route.seconds, 1.0)
+        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
         state.playing = state.flight < 1
 
 

@@ -20,7 +20,6 @@ from pansplat_viewer.core.state import (
     ViewerState,
     add_key_frame,
     choose_display,
-    fly_to,
     go_to_view,
     make_key_frame,
     show_path,
@@ -129,12 +128,6 @@ class Panels:
             self._draw_list(state, state.graph)
         if self.widgets.button("Stop" if state.playing else "Fly"):
             toggle_play(state)
-        imgui.same_line()
-        imgui.set_next_item_width(-1)
-        flight = self.widgets.slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
-        if flight != state.flight:
-            state.playing = False
-            fly_to(state, flight)
         if placing is not None and placing.is_listed:
             opened = any(view.placement.state != "placed" for view in placing.panoramas)
             self.widgets.section("Poses", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
