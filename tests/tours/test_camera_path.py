@@ -1,11 +1,11 @@
 """Camera paths pass their key frames smoothly, and their files are read strictly."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
 from pansplat.errors import InputError
 from pansplat.geometry.path import turn_axes
@@ -75,7 +75,7 @@ def test_a_path_in_the_world_of_a_scene_and_back_is_the_same():
     assert local.key_frames[0].position == pytest.approx((np.array(PATH.key_frames[0].position) - frame.origin) / 1e3)
     for frame_again, given in zip(local.map_places(frame.globalize_places).key_frames, PATH.key_frames, strict=True):
         assert frame_again.position == pytest.approx(given.position, abs=1e-5)
-        assert replace(frame_again, position=given.position) == given
+        assert structs.replace(frame_again, position=given.position) == given
 
 
 FRAME = '{"seconds": 0, "position": [0, 0, 0], "direction": [0, 0, 1]}'
