@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from shapely.geometry import Polygon
 
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys
@@ -24,7 +23,6 @@ class Rooms:
         level: right, down and forward (columns) of a level camera.
         positions: of the cameras of all views.
         floors, ceilings: their distances below and above the camera of each view, metres.
-        outlines: views and outline, anticlockwise, of each room of the plan.
         houses: the views of each storey of a world, if at least half of its rooms are on the plan.
         plan: the floor plan.
     """
@@ -33,7 +31,6 @@ class Rooms:
     positions: Float[np.ndarray, "view 3"]
     floors: Float[np.ndarray, "view"]
     ceilings: Float[np.ndarray, "view"]
-    outlines: tuple[tuple[tuple[int, ...], Polygon], ...]
     houses: tuple[tuple[int, ...], ...]
     plan: Plan
 
@@ -58,7 +55,6 @@ class Rooms:
 def find_rooms(facts: TourFacts) -> Rooms:
     """The rooms of a scene of all panoramas: those of the floor plan."""
     tour, plan = facts.tour, facts.plan
-    outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
     enclosed = {view for room in plan.rooms if room.is_closed for view in room.panoramas}
     houses = []
@@ -72,7 +68,6 @@ def find_rooms(facts: TourFacts) -> Rooms:
         tour.positions,
         np.array(facts.usual_heights),
         np.array([ceiling or _USUAL_CEILING * plan.camera_height for ceiling in facts.ceilings]),
-        tuple(outlines),
         tuple(houses),
         plan,
     )
