@@ -106,7 +106,7 @@ def build_panels(rooms: Rooms, is_open: Callable[[int, np.ndarray, float], bool]
         is_open: whether the cameras of a room see through a wall of it that is on the floor at a height (downwards).
     """
     panels: list[Panel] = []
-    down = rooms.positions @ rooms.level[:, 1]
+    down = rooms.eyes[:, 1]
     for house, views in enumerate(rooms.houses):
         shapes = {number: room.shape for number, room in enumerate(rooms.plan.rooms) if room.panoramas[0] in views}
         chosen = list(views)
@@ -242,7 +242,7 @@ def _list_nodes(rooms: Rooms, host: int) -> dict[int, tuple[float, Float[np.ndar
     for house in np.flatnonzero(np.array(rooms.hosts) == host).tolist():
         for view in rooms.houses[house]:
             turn = 0.0 if house == host else rooms.plan.drawn[view].turn or 0.0
-            found[view] = turn, rooms.level @ rooms.show(house, rooms.positions[view] @ rooms.level)
+            found[view] = turn, rooms.level @ rooms.show(house, rooms.eyes[view])
     return dict(sorted(found.items()))
 
 
@@ -325,7 +325,7 @@ class _Painter:
             if not scene.joint:
                 own &= scene.gaussians.views == view
             self.reaches.append(measure_reach(scene.gaussians.select(own), pose, _REACH_ROWS).cpu())
-        self.eyes = rooms.positions @ rooms.level
+        self.eyes = rooms.eyes
 
     def is_open(self, room: int, wall: Float[np.ndarray, "2 2"], floor: float) -> bool:
         """Whether the nearest camera of a room sees through a wall, which is open then, or a window."""

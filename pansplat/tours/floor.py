@@ -27,12 +27,10 @@ class FloorOutline:
     """Where the floor that one panorama shows ends, seen from above.
 
     Attributes:
-        center: of the camera, in the plan's coordinates: metres to the right and forward of the tour's level axes.
-        corners: end of the floor at equal steps of azimuth.
+        corners: end of the floor at equal steps of azimuth, metres to the right and forward of the tour's level axes.
         camera_height: of the camera over the floor, metres.
     """
 
-    center: Float[np.ndarray, "2"]
     corners: Float[np.ndarray, "azimuth 2"]
     camera_height: float
 
@@ -81,11 +79,7 @@ def find_floor_outline(surfaces: Surfaces) -> FloorOutline | None:
     stand on it, if these are nearer.
     """
     found = trace_floor(surfaces.samples)
-    if found is None:
-        return None
-    corners, height = found
-    center = surfaces.center[[0, 2]]
-    return FloorOutline(center, center + corners, height)
+    return None if found is None else FloorOutline(surfaces.center[[0, 2]] + found[0], found[1])
 
 
 def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "azimuth 2"], float] | None:

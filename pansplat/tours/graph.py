@@ -217,22 +217,17 @@ def find_tours(sets: Sequence[PanoramaSet]) -> list[TourGraph]:
     for each in sets:
         of_folder.setdefault(each.folder, []).append(each)
     joint = {folder for folder, group in of_folder.items() if _is_one_tour(group)}
+    others = [each for each in sets if each.folder not in joint]
     number: dict[Path, int] = {}
     edges: list[Edge] = []
-    for each in sets:
-        nodes = [number.setdefault(view.image, len(number)) for view in each.context]
-        edges += itertools.pairwise(nodes)
-        if each.folder in joint:
-            edges.append((number[of_folder[each.folder][0].context[0].image], nodes[0]))
+    for each in others:
+        edges += itertools.pairwise([number.setdefault(view.image, len(number)) for view in each.context])
     labels = label_components(len(number), edges)
     groups: dict[int, list[PanoramaSet]] = {}
-    for each in sets:
+    for each in others:
         groups.setdefault(labels[number[each.context[0].image]], []).append(each)
-    tours = [
-        _make_tour(group)
-        for label, group in groups.items()
-        if group[0].folder in joint or labels.count(label) >= _MIN_PANORAMAS
-    ]
+    tours = [_make_tour(group) for label, group in groups.items() if labels.count(label) >= _MIN_PANORAMAS]
+    tours += [_make_tour(of_folder[folder]) for folder in of_folder if folder in joint]
     if len(tours) > 1:
         tours = [dataclasses.replace(tour, name=f"{tour.name} {i}") for i, tour in enumerate(tours, start=1)]
     return tours

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from pansplat.gaussians.crop import keep_gaussians
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, SceneTour, Starts
 from pansplat.geometry.path import wrap_angle
-from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.inputs.placements import PLACED, ApproximatePlace, Placement
 from pansplat.tours.edges import find_walls
 from pansplat.tours.graph import TourGraph, ViewNumbers
 from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_sources
 from pansplat.tours.surfaces import find_surfaces
+
+_GRAPHS: WeakKeyDictionary[Scene, TourGraph] = WeakKeyDictionary()  # `render` needs that of a scene for each picture
 
 
 def merge_scenes(tour: TourGraph, load: Callable[[ViewNumbers], Scene], max_views: int = MAX_SCENE_VIEWS) -> Scene:
@@ -114,20 +113,14 @@ def select_views(scene: Scene, views: ViewNumbers) -> Scene:
 
 def make_graph(scene: Scene) -> TourGraph:
     """The graph of a scene's cameras, with the edges and links that `merge_scenes` has kept in the scene."""
-    return _make_graph(scene.tour, scene.cam2world, scene.names, scene.starts, (scene.near, scene.far), scene.frame)
+    if scene not in _GRAPHS:
+        _GRAPHS[scene] = _make_graph(scene, scene.tour or SceneTour(()))
+    return _GRAPHS[scene]
 
 
-@lru_cache(maxsize=8)  # `render` needs it for each picture
-def _make_graph(
-    tour: SceneTour | None,
-    cam2world: Float[Tensor, "view 4 4"],
-    titles: tuple[str, ...],
-    starts: Starts,
-    depth_range: tuple[float, float],
-    frame: WorldFrame,
-) -> TourGraph:
-    count, tour = len(cam2world), tour or SceneTour(())
-    titles = *titles[:count], *(f"panorama {k + 1}" for k in range(len(titles), count))
+def _make_graph(scene: Scene, tour: SceneTour) -> TourGraph:
+    count = len(scene.cam2world)
+    titles = [scene.names[k] if k < len(scene.names) else f"panorama {k + 1}" for k in range(count)]
     names = [f"{title} ({k + 1})" for k, title in enumerate(titles)]  # no two are equal, whatever the titles are
     links: list[list[Link]] = [[] for _ in range(count)]
     for start, end, yaw, pitch, text in tour.links:
@@ -143,13 +136,13 @@ def _make_graph(
             pose,
             title=titles[k],
             links=tuple(links[k]),
-            start=starts[k] if starts else None,
+            start=scene.starts[k] if scene.starts else None,
             placement=placements.get(k, PLACED),
-            frame=frame,
+            frame=scene.frame,
         )
-        for k, pose in enumerate(cam2world.double())
+        for k, pose in enumerate(scene.cam2world.double())
     )
     walls = [(a, b) for a, b, overlap in tour.overlaps if a != b and overlap == 0]
     overlaps = {(a, b): overlap for a, b, overlap in tour.overlaps}
-    graph = TourGraph("", Path(), panoramas, *depth_range, overlaps=overlaps)
+    graph = TourGraph("", Path(), panoramas, scene.near, scene.far, overlaps=overlaps)
     return graph.with_walls(walls) if walls else graph

@@ -31,7 +31,7 @@ from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.doll_house import Rooms
 from pansplat.tours.linked_rooms import DrawnPlace
 from pansplat.tours.merge import make_graph
-from pansplat.tours.plan import Door, Plan
+from pansplat.tours.plan import Door, Plan, Room
 
 FLOOR, CEILING = 1.5, -1.1  # from the cameras, downwards
 BOXES = (box(0, 0, 5, 4), box(5.2, 0, 8, 4))
@@ -59,7 +59,7 @@ def rooms(scene: Scene) -> Rooms:
     outlines = [np.array(box.exterior.coords)[:-1] for box in BOXES]
     found = (Room("", (0, 1), outlines[0], 0, True), Room("", (2,), outlines[1], 0, True))
     plan = Plan(make_graph(scene), found, (DOOR,), FLOOR, None, None, 3, 0)
-    return Rooms(np.eye(3), np.array(CAMERAS), np.full(3, FLOOR), np.full(3, -CEILING), ((0, 1, 2),), plan)
+    return Rooms(np.full(3, FLOOR), np.full(3, -CEILING), ((0, 1, 2),), plan)
 
 
 def _color(places: np.ndarray) -> np.ndarray:

@@ -62,6 +62,6 @@ def test_a_floor_without_walls_ends_where_most_of_it_does(rooms: Scene) -> None:
     ends = 2.0 / np.abs(rays).max(axis=1)
     beyond = np.abs((azimuths + np.pi / 4) % (np.pi / 2) - np.pi / 4) < np.pi / 10
     corners = rays * np.where(beyond, 6.0, ends)[:, None] + np.array((5.0, 0.0))
-    floor, surfaces = FloorOutline(np.array((5.0, 0.0)), corners, 1.5), TourFacts(rooms).surfaces[1]
+    floor, surfaces = FloorOutline(corners, 1.5), TourFacts(rooms).surfaces[1]
     outline = _enclose(surfaces, floor, np.eye(2), shapely.Polygon(), 1.5)
     assert shapely.Polygon(outline).bounds == pytest.approx((3.0, -2.0, 7.0, 2.0), abs=0.1)

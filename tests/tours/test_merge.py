@@ -92,7 +92,7 @@ def test_links_of_a_scene_lead_to_their_ends_whatever_the_titles_are():
     edges = tuple((view, view, 1.0) for view in range(5))
     scene = Scene(empty_gaussians(), torch.eye(4).repeat(5, 1, 1), 1.0, 2.0, titles, tour=SceneTour(edges, links))
     tour = make_graph(scene)
-    assert set(tour.links) == {*enumerate(ends)}
+    assert set(tour.links) == {*enumerate(ends)} and make_graph(scene) is tour, "made once"
     assert tuple(panorama.title for panorama in tour.panoramas) == titles
 
 

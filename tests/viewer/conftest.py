@@ -318,7 +318,7 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     angles = torch.linspace(0, 2 * torch.pi, 13)[:-1]
     corners = torch.stack((angles.sin(), angles.cos()), dim=1).double().numpy()
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
-    outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
+    outlines = {view: FloorOutline(center + corners, 1.0) for view, center in centers.items()}
     facts = TourFacts(scene, tour, entry.views)
     outlooks = np.zeros((len(entry.views), BINS))
     vars(facts).update(
