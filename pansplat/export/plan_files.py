@@ -135,7 +135,7 @@ def _format_number(plan: Plan, value: float, decimals: int, power: int = 1) -> s
         value: in metres of the plan.
         decimals: of metres; in other units as many digits are written.
     """
-    factor = plan.frame.unit**power
+    factor = plan.tour.panoramas[0].frame.unit ** power
     return f"{factor * value:.{max(decimals - round(math.log10(factor)), 0)}f}"
 
 
@@ -237,7 +237,8 @@ class _Drawing:
     @cached_property
     def notes(self) -> list[str]:
         """Lines below the plan."""
-        scale = f"1:{self.plan.frame.unit / _PAPER:g} on paper; the bar is {self.plan.frame.unit:g} m"
+        unit = self.plan.tour.panoramas[0].frame.unit
+        scale = f"1:{unit / _PAPER:g} on paper; the bar is {unit:g} m"
         return [] if self.is_small else [*describe_plan(self.plan), scale]
 
     def list_texts(self) -> list[_Text]:

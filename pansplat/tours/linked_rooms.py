@@ -19,10 +19,7 @@ from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import RAY_DIRECTIONS, Outline, meet_outline
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
-_ASIDE, _LINK_ERROR = (
-    range(-180, 180, 6),
-    12.0,
-)  # angles between a door and its link, all and the usual one, degrees
+_ASIDE, _LINK_ERROR = range(-180, 180, 6), 12.0  # tried and usual angles between a door and its link, degrees
 _THICKNESS, _STEP = 0.08, 0.45  # thickness of a wall between two rooms; distance of a dot from the wall before it
 _MOST_OVERLAP, _PUSH = 0.01, 0.1  # largest share of a room that is in others; length of a step away from them
 _APART, _FARTHEST = 9.0, 200.0  # cost of a unit away from the door; least cost of a place that is not used

@@ -21,20 +21,11 @@ import shapely
 from jaxtyping import Bool, Float
 from shapely.geometry import Polygon
 
-from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
 from pansplat.tours.floor import FloorOutline, assign_storeys, choose_camera_height
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
-from pansplat.tours.surfaces import (
-    RAY_ANGLES,
-    RAY_DIRECTIONS,
-    RAYS,
-    Outline,
-    Surfaces,
-    meet_outline,
-    split_by_azimuth,
-)
+from pansplat.tours.surfaces import RAY_ANGLES, RAY_DIRECTIONS, RAYS, Outline, Surfaces, meet_outline, split_by_azimuth
 
 # What a panorama shows of walls.
 _WALL_BAND = 0.6, 0.85  # walls are sought between these fractions of the ceiling's height over the camera
@@ -129,11 +120,6 @@ class Plan:
     wall_error: float | None
     num_heights: int
     num_walls: int
-
-    @property
-    def frame(self) -> WorldFrame:
-        """Where the world of the plan is in that of files."""
-        return self.tour.panoramas[0].frame
 
     @cached_property
     def drawn(self) -> dict[int, DrawnPlace]:

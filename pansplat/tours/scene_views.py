@@ -55,8 +55,7 @@ def choose_sources(tour: TourGraph, max_views: int = MAX_SCENE_VIEWS) -> dict[Vi
     sources: dict[ViewNumbers, tuple[int, ...]] = {}
     missing = set(range(len(tour)))
     for views in scenes:
-        provided = tuple(node for node in views if node in missing)
-        if provided:
+        if provided := tuple(node for node in views if node in missing):
             sources[views] = provided
             missing -= set(provided)
     return sources

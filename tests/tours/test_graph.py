@@ -60,7 +60,11 @@ def test_single_views_are_between_the_other_panoramas_of_a_tour_in_file_order(ma
     )
     (tour,) = find_tours([together, alone])
     assert [panorama.name for panorama in tour.panoramas] == ["p0", "p1", "p2"] and tour.parts == (0, 1, 0)
-    assert set(tour.overlaps) == {(0, 2), (1, 1)} and tour.make_set((0, 2)).context == (a, c)
+    assert (
+        set(tour.overlaps) == {(0, 2), (1, 1)}
+        and tour.make_set((0, 2)).context == (a, c)
+        and tour.make_set((0, 2)).name == "p0-p2"
+    )
 
 
 def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home):
@@ -114,12 +118,6 @@ def test_a_link_is_a_direction_in_the_world(home):
     assert set(home.links) == {(2, 3), (3, 2), (3, 6)}
     assert np.allclose(home.find_direction(2, 3), (-math.cos(0.4), math.sin(0.4), 0)), "left and below the horizon"
     assert home.find_direction(6, 3) is None
-
-
-def test_a_pair_of_a_scene_has_its_panoramas(comb):
-    pair = comb.make_set((1, 4))
-    assert pair.name == "p1-p4" and pair.context == (comb.panoramas[1], comb.panoramas[4])
-    assert (pair.near, pair.far, pair.targets) == (0.45, 10.0, ())
 
 
 def test_no_flight_leads_through_a_wall_and_places_stay_known(comb):

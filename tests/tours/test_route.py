@@ -83,14 +83,8 @@ def test_a_route_ends_in_the_start_view_and_passes_those_on_the_way(comb):
     assert [step.kind for step in route.steps] == ["flight", "flight", "turn"]
     assert np.allclose(route.pose(1)[:3, 2], _look(tour, 2))
     visits = plan_route(tour, [0, 1, 0, 4], rest=1.5)
-    assert [step.kind for step in visits.steps if step.kind != "turn"] == [
-        "rest",
-        "flight",
-        "rest",
-        "flight",
-        "flight",
-        "rest",
-    ]
+    kinds = [step.kind for step in visits.steps if step.kind != "turn"]
+    assert kinds == ["rest", "flight", "rest", "flight", "flight", "rest"]
     assert list(visits.visits) == [0, 1, 4], "once"
     for node, at in visits.visits.items():
         moment = visits.at(at)
@@ -138,11 +132,8 @@ def test_the_camera_looks_along_its_way_in_any_world(comb):
 
 def test_a_zoom_turns_to_the_link_grows_and_arrives_away_from_the_link_back(home):
     route = plan_route(home, [2, 3], _start(home, 2))
-    assert [(step.kind, round(step.seconds, 3)) for step in route.steps] == [
-        ("turn", 0.4),
-        ("zoom", 0.7),
-        ("rest", 0.1),
-    ]
+    assert [step.kind for step in route.steps] == ["turn", "zoom", "rest"]
+    assert [step.seconds for step in route.steps] == pytest.approx([0.4, 0.7, 0.1])
     zoom = [moment for moment in _watch(route) if moment.arrival is not None]
     link = turn_axes(np.eye(3), -math.pi / 2, -0.2)[:, 2]  # the ring is lower, 0.4
     for moment in zoom:
