@@ -47,12 +47,6 @@ class KeyFrame(Struct, frozen=True, forbid_unknown_fields=True):
     direction: Vector  # where the camera looks
     vertical_fov_degrees: Annotated[float, Meta(ge=MIN_FOV_DEGREES, le=MAX_FOV_DEGREES)] = 75.0
 
-    @staticmethod
-    def of_pose(pose: Float[np.ndarray, "4 4"], seconds: float, vertical_fov_degrees: float) -> KeyFrame:
-        """The key frame of a camera."""
-        (px, py, pz), (dx, dy, dz) = pose[:3, 3].tolist(), pose[:3, 2].tolist()
-        return KeyFrame(seconds, (px, py, pz), (dx, dy, dz), vertical_fov_degrees)
-
 
 @dataclass(frozen=True)
 class CameraPath:

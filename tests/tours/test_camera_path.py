@@ -47,7 +47,7 @@ def test_a_path_turns_the_short_way():
 def test_key_frames_are_level_in_the_axes_of_the_scene():
     level, pose = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))), np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn_axes(level, 0.7, -0.3), (1, 2, 3)
-    path = CameraPath().add(KeyFrame.of_pose(pose, 0.0, 50.0))
+    path = CameraPath().add(KeyFrame(0.0, tuple(pose[:3, 3]), tuple(pose[:3, 2]), 50.0))
     again, fov = path.interpolate(0.0, level)
     assert np.allclose(again, pose) and fov == 50.0
 

@@ -60,11 +60,8 @@ def test_single_views_are_between_the_other_panoramas_of_a_tour_in_file_order(ma
     )
     (tour,) = find_tours([together, alone])
     assert [panorama.name for panorama in tour.panoramas] == ["p0", "p1", "p2"] and tour.parts == (0, 1, 0)
-    assert (
-        set(tour.overlaps) == {(0, 2), (1, 1)}
-        and tour.make_set((0, 2)).context == (a, c)
-        and tour.make_set((0, 2)).name == "p0-p2"
-    )
+    pair = tour.make_set((0, 2))
+    assert set(tour.overlaps) == {(0, 2), (1, 1)} and pair.context == (a, c) and pair.name == "p0-p2"
 
 
 def test_the_depth_range_of_a_tour_is_that_of_the_pairs_with_several_views(home):

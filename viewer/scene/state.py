@@ -230,7 +230,8 @@ def add_key_frame(state: ViewerState) -> None:
 
 def make_key_frame(camera: Camera, seconds: float) -> KeyFrame:
     """The camera as a key frame."""
-    return KeyFrame.of_pose(camera.cam2world, seconds, camera.vertical_fov_degrees)
+    place, ahead = (tuple(camera.cam2world[:3, column].tolist()) for column in (3, 2))
+    return KeyFrame(seconds, place, ahead, camera.vertical_fov_degrees)
 
 
 def show_path(state: ViewerState, seconds: float) -> None:
