@@ -25,7 +25,9 @@ from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load, load_sets, predict, predict_to_file, predict_tour, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
-from pansplat.tours.graph import TourGraph, find_tours, select_views
+from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.tours.merge import select_views
+from pansplat.tours.scene_views import choose_sources
 
 HEIGHT = 16
 
@@ -145,7 +147,7 @@ def test_a_folder_of_several_pairs_names_the_call_for_all_of_it_which_takes_its_
     house = write_tour(tmp_path / "house", 4)
     expect_error(r"holds 3 pairs .*predict_tour", lambda: predict(house, sphere_predictor()))
     scene = predict_tour(house, sphere_predictor(), height=64, cache=False)
-    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.overlaps) >= 3
+    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.tour.overlaps) >= 3
     expect_error("0 tours", lambda: predict_tour(write_pair(tmp_path / "pair"), sphere_predictor()))
 
 
@@ -166,7 +168,7 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
     torch.testing.assert_close(*colors, atol=1e-5, rtol=0)
     others = render(select_views(cut, (2, 3)), pose, size=(32, 64))
     assert (drawn.alpha[hole] == others.alpha[hole]).all() and others.alpha[hole].min() > 0.9
-    assert not torch.allclose(of_edge.color, render(replace(cut, overlaps=()), pose, size=(32, 64)).color, atol=0.05)
+    assert not torch.allclose(of_edge.color, render(replace(cut, tour=None), pose, size=(32, 64)).color, atol=0.05)
 
 
 @pytest.mark.parametrize("blending", ["deferred", "joint"])
@@ -177,7 +179,7 @@ def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
-    assert [edge[:2] for edge in whole.overlaps] == [(0, 1), (2, 2)]
+    assert [edge[:2] for edge in whole.tour.overlaps] == [(0, 1), (2, 2)]
     options = {"size": (32, 64), "blend": blending}
     for views in ((0, 1), (2,)):
         pose = tour.cam2world[views[0]].clone()
@@ -341,10 +343,10 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
     (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     predictor = sphere_predictor()
     scene = predict_tour(tour, predictor, cache=False)
-    assert predictor.calls == len(tour.choose_sources()) == 3
+    assert predictor.calls == len(choose_sources(tour)) == 3
     assert scene.gaussians.views.bincount().tolist() == [64 * 128] * 4  # the smallest height
     assert scene.cam2world.equal(tour.cam2world) and scene.names == tuple(f"p{k}" for k in range(4))
-    assert [edge[:2] for edge in scene.overlaps] == list(tour.overlaps)
+    assert [edge[:2] for edge in scene.tour.overlaps] == list(tour.overlaps)
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))
     predictor.calls, predictor.max_views = 0, 4

@@ -164,10 +164,10 @@ class Render(Computation):
         """The frames of a film: of a path, or of the flight through all input cameras."""
         from pansplat.export.film import follow_path, list_flight
         from pansplat.geometry.path import fly_pose
-        from pansplat.tours.graph import make_graph
+        from pansplat.tours.merge import make_graph
 
         if path is not None:
-            return follow_path(path, self.fps, scene, make_graph(scene) if scene.overlaps else None)
+            return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
         flight = _plan_route(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
@@ -185,7 +185,7 @@ class Render(Computation):
         from pansplat.tours.route import NEAR_OF_FAR
 
         is_perspective = options["layout"] == "pinhole"
-        near = NEAR_OF_FAR * scene.far if scene.overlaps else NEAR
+        near = NEAR_OF_FAR * scene.far if scene.tour else NEAR
 
         @functools.lru_cache(maxsize=2)
         def renderer(shown: Scene) -> Callable[..., Rendering]:
@@ -205,13 +205,14 @@ class Render(Computation):
 
 def _plan_route(scene: Scene) -> Route | None:
     """The way through a tour; None for another scene."""
-    from pansplat.tours.graph import make_graph
+    from pansplat.tours.merge import make_graph
     from pansplat.tours.route import REST_SECONDS, plan_route
+    from pansplat.tours.walks import plan_walk
 
-    if not scene.overlaps:
+    if scene.tour is None:
         return None
     tour = make_graph(scene)
-    return plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+    return plan_route(tour, plan_walk(tour), rest=REST_SECONDS)
 
 
 def read_pose(path: Path) -> Tensor:

@@ -106,9 +106,9 @@ def build_panels(rooms: Rooms, is_open: Callable[[int, np.ndarray, float], bool]
         is_open: whether the cameras of a room see through a wall of it that is on the floor at a height (downwards).
     """
     panels: list[Panel] = []
-    down = rooms.positions @ rooms.level[:, 1]
+    down = rooms.eyes[:, 1]
     for house, views in enumerate(rooms.houses):
-        shapes = {number: shape for number, (nodes, shape) in enumerate(rooms.outlines) if nodes[0] in views}
+        shapes = {number: room.shape for number, room in enumerate(rooms.plan.rooms) if room.panoramas[0] in views}
         chosen = list(views)
         unit, ceiling = float(np.median(rooms.floors[chosen])), float(np.median(rooms.ceilings[chosen]))
         eye, floor = float(np.median(down[chosen])), float(np.median((down + rooms.floors)[chosen]))
@@ -242,7 +242,7 @@ def _list_nodes(rooms: Rooms, host: int) -> dict[int, tuple[float, Float[np.ndar
     for house in np.flatnonzero(np.array(rooms.hosts) == host).tolist():
         for view in rooms.houses[house]:
             turn = 0.0 if house == host else rooms.plan.drawn[view].turn or 0.0
-            found[view] = turn, rooms.level @ rooms.show(house, rooms.positions[view] @ rooms.level)
+            found[view] = turn, rooms.level @ rooms.show(house, rooms.eyes[view])
     return dict(sorted(found.items()))
 
 
@@ -325,11 +325,11 @@ class _Painter:
             if not scene.joint:
                 own &= scene.gaussians.views == view
             self.reaches.append(measure_reach(scene.gaussians.select(own), pose, _REACH_ROWS).cpu())
-        self.eyes = rooms.positions @ rooms.level
+        self.eyes = rooms.eyes
 
     def is_open(self, room: int, wall: Float[np.ndarray, "2 2"], floor: float) -> bool:
         """Whether the nearest camera of a room sees through a wall, which is open then, or a window."""
-        views, (start, end) = self.rooms.outlines[room][0], wall
+        views, (start, end) = self.rooms.plan.rooms[room].panoramas, wall
         view = min(views, key=lambda view: np.linalg.norm(self.eyes[view][[0, 2]] - (start + end) / 2))
         shares, heights = np.meshgrid(np.linspace(0.1, 0.9, 9), np.linspace(0, 0.8, 5))
         flat = start + shares.reshape(-1, 1) * (end - start)
@@ -367,7 +367,7 @@ class _Painter:
         self, panel: Panel, grid: Float[np.ndarray, "h w 2"], view: int, unit: float
     ) -> Float[np.ndarray, "h w"]:
         """How badly a camera shows places of a panel: its distance, more where something is in front; inf if unseen."""
-        views, outline = self.rooms.outlines[panel.room]
+        room = self.rooms.plan.rooms[panel.room]
         places, normal = panel.locate(grid), np.cross(panel.down, panel.right)  # into the room
         offsets = places - self.eyes[view]
         distance = np.linalg.norm(offsets, axis=-1)
@@ -376,8 +376,9 @@ class _Painter:
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
         is_below = (np.hypot(offsets[..., 0], offsets[..., 2]) < _TRIPOD * unit) & (offsets[..., 1] > 0.5 * unit)
         cost = distance * (1 + (_HIDDEN - 1) * (1 - clear))
-        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in views)) & ~is_below
+        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in room.panoramas)) & ~is_below
         ahead = shapely.Point(self.eyes[view][[0, 2]])
+        outline = room.shape
         if outline.contains(ahead) and outline.area < 0.999 * outline.convex_hull.area:
             flat = (places + _ASIDE * unit * normal)[..., (0, 2)][is_seen]
             ways = shapely.linestrings(np.stack(np.broadcast_arrays(flat, self.eyes[view][[0, 2]]), axis=-2))

@@ -59,11 +59,15 @@ from pansplat.system.files import SOFTWARE, is_written
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
+from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.layout import REACH
+from pansplat.tours.limits import EDGE_HYSTERESIS
 from pansplat.tours.links import find_link_ring, link_parts
+from pansplat.tours.merge import select_views
 from pansplat.tours.outlook import find_widest
 from pansplat.tours.route import find_angles, find_start_angles
+from pansplat.tours.scene_views import choose_scene_views
+from pansplat.tours.walks import find_next_nodes, plan_walk
 
 DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
 PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
@@ -144,14 +148,14 @@ def write_page(
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report_progress("checking the scene", 0.0)
-    if scene.joint and scene.overlaps:
+    if scene.joint and scene.tour:
         warnings.warn(
             "a page follows the edges of a tour with all Gaussians of each panorama, got each surface once; its "
             "flights are straight. Export the folder of the photographs, or a scene file of --layers.",
             InputWarning,
             stacklevel=2,
         )
-        scene = dataclasses.replace(scene, overlaps=(), links=(), starts=(), approximate=())
+        scene = dataclasses.replace(scene, starts=(), tour=None)
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
     facts = TourFacts(
         scene if has_cameras else prepared,
@@ -245,13 +249,13 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
         tour, facts: of the scene before.
     """
     views = tuple(range(len(scene.cam2world)))
-    walk = tuple(dict.fromkeys(tour.plan_walk())) if tour.overlaps else views
+    walk = tuple(dict.fromkeys(plan_walk(tour))) if tour.overlaps else views
     start, level = scene.cam2world[walk[0]].clone(), tour.level_axes
     yaw, pitch = _find_ahead(tour, facts, walk[0])
     start[:3, :3] = torch.from_numpy(turn_axes(level, yaw, pitch))
     if not tour.overlaps:
         return _Flights(start, level, yaw, pitch, (0,) * len(views), (views,), walk)
-    scenes = tour.choose_scene_views()
+    scenes = choose_scene_views(tour)
     groups = tuple(dict.fromkeys(scenes.values()))
     return _Flights(
         start,
@@ -262,7 +266,7 @@ def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
         groups,
         walk,
         tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps),
-        tuple(tuple(row) for row in tour.find_next_nodes()),
+        tuple(tuple(row) for row in find_next_nodes(tour)),
         EDGE_HYSTERESIS,
     )
 
@@ -486,7 +490,7 @@ def _describe_links(
     for (start, end), link in tour.links.items():
         direction = tour.find_direction(start, end)
         assert direction is not None
-        yaw, pitch = find_angles(tour.level_axes.T @ direction)
+        yaw, pitch = find_angles(direction)
         found = {"from": start, "to": end, "text": link.text, "yaw": round(yaw, 5), "pitch": round(pitch, 5)}
         ring = find_link_ring(tour, start, end, heights[start], outlooks[start])
         if ring is not None and (tour.parts[start] != tour.parts[end] or end in spots[start]["hidden"]):

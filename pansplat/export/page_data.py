@@ -24,8 +24,8 @@ from pansplat.geometry.morton import morton_codes
 from pansplat.geometry.pose import AHEAD_EXPONENT
 from pansplat.system.files import SOFTWARE
 from pansplat.tours import route
-from pansplat.tours.graph import CLEARANCE, POOR_REACH
 from pansplat.tours.layout import REACH
+from pansplat.tours.limits import CLEARANCE, POOR_REACH
 from pansplat.tours.links import RING_DISTANCE, RING_RADIUS
 
 MAX_DEGREE = 3  # of the harmonics of a page

@@ -34,7 +34,9 @@ from pansplat.images.masks import mask_holes
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, make_unique_name
 from pansplat.system.progress import report_progress
-from pansplat.tours.graph import TourGraph, make_graph, select_views
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.scene_views import choose_scene_views
 
 MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
 MAX_HEIGHT = 4096  # of a photograph in a folder
@@ -179,11 +181,11 @@ def load_photograph(
 def _select_shown(scene: Scene, view: int) -> tuple[Scene, Float[Tensor, "4 4"]]:
     """What a page draws at a panorama, and its pose (4, 4)."""
     pose = scene.cam2world[view]
-    if not scene.overlaps:
+    if scene.tour is None:
         return scene, pose
     tour = make_graph(scene)
     edge, _ = tour.find_nearest_edge(pose[:3, 3].numpy())
-    return select_views(scene, tour.choose_scene_views()[edge]), pose
+    return select_views(scene, choose_scene_views(tour)[edge]), pose
 
 
 def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

@@ -107,7 +107,7 @@ def draw_page_plan(plan: Plan) -> tuple[bytes, tuple[float, float], list[tuple[f
 def describe_plan(plan: Plan) -> list[str]:
     """Lines on the size of a plan and its uncertainty."""
     closed = [room for room in plan.rooms if room.is_closed]
-    area = sum(room.area for room in closed)
+    area = sum(room.shape.area for room in closed)
     spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
     count = describe_count(plan.num_heights, "panorama")
     lines = [
@@ -135,7 +135,7 @@ def _format_number(plan: Plan, value: float, decimals: int, power: int = 1) -> s
         value: in metres of the plan.
         decimals: of metres; in other units as many digits are written.
     """
-    factor = plan.frame.unit**power
+    factor = plan.tour.panoramas[0].frame.unit ** power
     return f"{factor * value:.{max(decimals - round(math.log10(factor)), 0)}f}"
 
 
@@ -237,7 +237,8 @@ class _Drawing:
     @cached_property
     def notes(self) -> list[str]:
         """Lines below the plan."""
-        scale = f"1:{self.plan.frame.unit / _PAPER:g} on paper; the bar is {self.plan.frame.unit:g} m"
+        unit = self.plan.tour.panoramas[0].frame.unit
+        scale = f"1:{unit / _PAPER:g} on paper; the bar is {unit:g} m"
         return [] if self.is_small else [*describe_plan(self.plan), scale]
 
     def list_texts(self) -> list[_Text]:
@@ -263,7 +264,8 @@ class _Drawing:
             free -= shapely.MultiPoint(others).buffer(6 * small)
             circle = shapely.maximum_inscribed_circle(shape if free.is_empty else free)
             (x, y), radius = circle.coords[0], circle.length
-            area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
+            values = room.shape.area, self.plan.area_error(room)
+            area, error = (_format_number(self.plan, value, 1, power=2) for value in values)
             lines = [f"{area} m² ± {error}"] * room.is_closed + ["about here"] * (room.panoramas[0] in self.plan.drawn)
             for row, text in zip((0.7, -0.7, -2.1), [room.name, *lines[: 0 if self.is_small else None]], strict=False):
                 size = min(large, 0.9 * radius / math.hypot(_LETTER * len(text) / 2, abs(row) + 0.5))

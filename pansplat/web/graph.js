@@ -1,5 +1,5 @@
-// Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of the methods of
-// pansplat.tours.graph.TourGraph that they name; tests/web/test_browser.py compares them.
+// Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of those of
+// pansplat.tours.graph, walks and limits that they name; tests/web/test_modules.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
 // on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; the `reach` around a part,
@@ -28,7 +28,7 @@ export function closestOnEdge(graph, edge, position) {
   return plus(from, scaled(along, fraction));
 }
 
-// measure_distance
+// measure_distances, of one edge
 const distanceToEdge = (graph, edge, position) => distanceOf(position, closestOnEdge(graph, edge, position));
 
 export const partOfEdge = (graph, edge) => graph.parts[graph.edges[edge][0]];

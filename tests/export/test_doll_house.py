@@ -25,12 +25,13 @@ from pansplat.export.doll_house import (
     build_panels,
     make_house,
 )
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.doll_house import Rooms
-from pansplat.tours.graph import DrawnPlace, make_graph
-from pansplat.tours.plan import Door, Plan
+from pansplat.tours.linked_rooms import DrawnPlace
+from pansplat.tours.merge import make_graph
+from pansplat.tours.plan import Door, Plan, Room
 
 FLOOR, CEILING = 1.5, -1.1  # from the cameras, downwards
 BOXES = (box(0, 0, 5, 4), box(5.2, 0, 8, 4))
@@ -49,16 +50,16 @@ def scene() -> Scene:
     """Two rooms: the first one with two cameras."""
     seen = [see_box(*_box_of(view), np.array(place), 20_000) for view, place in enumerate(CAMERAS)]
     gaussians = make_balls(torch.cat(seen), 0.03, views=torch.arange(3).repeat_interleave(20_000))
-    return Scene(gaussians, place_cameras(*CAMERAS), 0.3, 12.0, overlaps=((0, 1, 0.9), (1, 2, 0.3)))
+    return Scene(gaussians, place_cameras(*CAMERAS), 0.3, 12.0, tour=SceneTour(((0, 1, 0.9), (1, 2, 0.3))))
 
 
 @pytest.fixture(scope="module")
 def rooms(scene: Scene) -> Rooms:
     """The known rooms."""
-    plan = Plan(make_graph(scene), (), (DOOR,), FLOOR, None, None, 3, 0)
-    heights = np.full(3, FLOOR), np.full(3, -CEILING)
-    outlines = ((0, 1), BOXES[0]), ((2,), BOXES[1])
-    return Rooms(np.eye(3), np.array(CAMERAS), *heights, outlines, ((0, 1, 2),), plan)
+    outlines = [np.array(box.exterior.coords)[:-1] for box in BOXES]
+    found = (Room("", (0, 1), outlines[0], 0, True), Room("", (2,), outlines[1], 0, True))
+    plan = Plan(make_graph(scene), found, (DOOR,), FLOOR, None, None, 3, 0)
+    return Rooms(np.full(3, FLOOR), np.full(3, -CEILING), ((0, 1, 2),), plan)
 
 
 def _color(places: np.ndarray) -> np.ndarray:

@@ -11,7 +11,9 @@ from pytest import approx
 from pansplat.errors import InputWarning
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.inputs.folders import load_sets
-from pansplat.tours.graph import find_tours, merge_scenes
+from pansplat.tours.graph import find_tours
+from pansplat.tours.linked_rooms import find_stated_place
+from pansplat.tours.merge import merge_scenes
 
 
 def test_an_approximate_place_is_as_far_away_in_every_unit_of_measured_poses(tmp_path: Path):
@@ -30,7 +32,7 @@ def test_an_approximate_place_is_as_far_away_in_every_unit_of_measured_poses(tmp
         with pytest.warns(InputWarning, match=r"no pose of c\.png"):
             (tour,) = find_tours(load_sets(folder))
         centers = tour.positions @ tour.level_axes[:, (0, 2)]
-        away = tour.approximate[2].move(centers[2]) - centers[0]
+        away = find_stated_place(tour, 2).move(centers[2]) - centers[0]
         assert tour.panoramas[2].name == "c" and np.linalg.norm(away) == approx(3)
         scene = merge_scenes(tour, lambda v, t=tour: Scene(empty_gaussians(), t.cam2world[list(v)], 1.0, 9.0))
-        assert scene.approximate[0][:4] == (2, 0, approx(0), approx(3 * unit))
+        assert scene.tour.approximate[0][:4] == (2, 0, approx(0), approx(3 * unit))

@@ -9,14 +9,7 @@ from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Scene
-from pansplat.tours.outlook import (
-    BINS,
-    find_clearance,
-    find_hidden,
-    find_widest,
-    measure_clearance,
-    measure_outlook,
-)
+from pansplat.tours.outlook import BINS, find_clearance, find_hidden, find_widest, measure_clearance, measure_outlook
 from pansplat.tours.surfaces import Surfaces, find_surfaces
 
 

@@ -39,7 +39,7 @@ from pansplat.inputs.panorama_sets import Note, PanoramaSet
 from pansplat.notebook import _bundle_scene
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.graph import make_graph, select_views
+from pansplat.tours.merge import make_graph, select_views
 
 SIZE = (320, 240)
 LIMIT = 180  # seconds, after which a state that the page does not reach is an error
@@ -415,7 +415,7 @@ def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_bac
         eye, down = camera["position"] + origin, rooms.level[:, 1]
         floor = float(np.mean(cameras @ down + rooms.floors))
         places = eye + ((floor - eye @ down) / (rays @ down))[..., None] * rays
-        (_, outline), flat = rooms.outlines[0], places @ rooms.level[:, (0, 2)]
+        outline, flat = rooms.plan.rooms[0].shape, places @ rooms.level[:, (0, 2)]
         nearest = np.linalg.norm(places[:, :, None] - cameras, axis=-1)
         is_clear = shapely.contains_xy(outline.buffer(-0.1), flat[..., 0], flat[..., 1])
         is_clear &= (np.abs(nearest[..., 0] - nearest[..., 1]) > 0.5) & (nearest.min(axis=-1) > 1.3 * rooms.floors[0])

@@ -19,7 +19,9 @@ import torch
 from pansplat.export.page_data import PageConstants, PageHeader
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.panorama_sets import Link, Panorama
-from pansplat.tours.graph import EDGE_HYSTERESIS, TourGraph
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.limits import EDGE_HYSTERESIS, follow_edge, limit_step
+from pansplat.tours.walks import find_next_nodes, find_way
 
 FOLDER = Path(str(resources.files("pansplat.web")))
 MODULES = {file.name: file.read_text("utf-8") for file in FOLDER.glob("*.js")}
@@ -149,7 +151,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         "positions": places.tolist(),
         "parts": tour.parts,
         "edges": edges,
-        "next": tour.find_next_nodes(),
+        "next": find_next_nodes(tour),
         "poor": tour.poor,
         "clearances": [clearances[view].tolist() if view in clearances else [] for view in range(len(places))],
         "level": tour.level_axes.tolist(),
@@ -183,14 +185,14 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         edge = edges[number]
         assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
         assert tuple(case["ofPart"]) == tour.find_nearest_edge(position, tour.parts[edge[0]])[0]
-        assert tuple(case["followed"]) == tour.follow_edge(position, edge)
-        assert case["ways"] == [tour.find_way(position, node) for node in nodes]
-        assert case["waysOfPart"] == [tour.find_way(position, node, 0) for node in nodes]
+        assert tuple(case["followed"]) == follow_edge(tour, position, edge)
+        assert case["ways"] == [find_way(tour, position, node) for node in nodes]
+        assert case["waysOfPart"] == [find_way(tour, position, node, 0) for node in nodes]
         assert case["fades"] == [tour.is_fade(node, edge[0]) for node in nodes]
-    steps = [tour.limit_step(start, end) for start, end in zip(starts, positions, strict=True)]
+    steps = [limit_step(tour, start, end) for start, end in zip(starts, positions, strict=True)]
     np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
     free = dataclasses.replace(tour, clearances={})
-    along = [free.limit_step(start, end) for start, end in zip(starts, positions, strict=True)]
+    along = [limit_step(free, start, end) for start, end in zip(starts, positions, strict=True)]
     for before, after in ((positions, along), (along, steps)):
         assert 0 < np.any(np.abs(np.array(before) - after) > 1e-6, axis=1).sum() < 30
     followed = [tuple(case["followed"]) for case in found]

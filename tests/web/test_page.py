@@ -27,7 +27,7 @@ from pansplat.export import page as page_module
 from pansplat.export.page import write_page
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.panorama_sets import PanoramaSet
@@ -36,8 +36,8 @@ from pansplat.system.atomic import replacing
 from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_floor
-from pansplat.tours.graph import make_graph, select_views
-from pansplat.tours.outlook import find_bin, measure_clearance, measure_outlook
+from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.outlook import find_bins, measure_clearance, measure_outlook
 from pansplat.tours.surfaces import find_surfaces
 
 
@@ -138,7 +138,10 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
 def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
     """The nearest ones of two parts without a link; others have that of their tour."""
     walls = tuple((node, alone, 0.0) for alone in (2, 3) for node in (0, 1))
-    write_page(dataclasses.replace(flat, overlaps=(*flat.overlaps, *walls)), tmp_path / "page.html")
+    write_page(
+        dataclasses.replace(flat, tour=SceneTour((*flat.tour.overlaps, *walls), flat.tour.links)),
+        tmp_path / "page.html",
+    )
     header = read_header(tmp_path / "page.html")
     spots, level = header["spots"], np.array(header["level"])
     places = np.array([spot["position"] for spot in spots])
@@ -159,7 +162,7 @@ def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch
     assert (poor.num_flights, len(poor.fades)) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
     assert poor.fades == tuple(zip(house.names[:2], house.names[1:], strict=True)), "the labels"
     assert set(header["parts"]) == {0} and header["walk"] == [0, 1, 2]
-    joint = dataclasses.replace(house, joint=True, overlaps=())
+    joint = dataclasses.replace(house, joint=True, tour=None)
     assert write_page(joint, tmp_path / "joint.html").fades == ()
 
 
@@ -191,7 +194,7 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4) and to["pitch"] == -0.6
     right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
-    wall = measure_outlook(find_surfaces(flat, level)[0])[find_bin(0.5 * math.pi)]
+    wall = measure_outlook(find_surfaces(flat, level)[0])[find_bins(np.array(0.5 * math.pi))]
     assert (right, ahead) == pytest.approx((max(down / np.tan(0.6), 1), 0), rel=0.01, abs=1e-5) and right < wall
     assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
     assert sorted(header["walk"]) == [0, 1, 2, 3] and header["walk"][0] == 0
@@ -205,7 +208,7 @@ def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(
     header = read_header(tmp_path / "tour.html")
     assert [view["count"] > 0 for view in header["views"]] == [True, True, False, False]
     assert header["limits"] == [pytest.approx(2.0), 0, 0] and header["loading"] == [0, 1, 2, 3]
-    alone = dataclasses.replace(flat, overlaps=tuple((node, node, 1.0) for node in range(4)))
+    alone = dataclasses.replace(flat, tour=SceneTour(tuple((node, node, 1.0) for node in range(4)), flat.tour.links))
     written = write_page(alone, tmp_path / "alone.html", photographs=photographs)
     assert written.num_gaussians == 0 and read_header(tmp_path / "alone.html")["limits"] == [0] * 4
 
@@ -503,4 +506,4 @@ def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, t
     assert len(header["spots"]) == 3 and header["edges"] == [] and header["count"] == len(house.gaussians)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        write_page(dataclasses.replace(fused, overlaps=()), tmp_path / "pair.html")
+        write_page(dataclasses.replace(fused, tour=None), tmp_path / "pair.html")
