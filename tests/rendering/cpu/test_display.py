@@ -1,13 +1,14 @@
 """Images for a screen: selection of the Gaussians in view, layers, bytes, and views from cube faces."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
+from dense_renderer import POSE, make_scene
 
 from pansplat.constants import FILTER_VARIANCE, NEAR
-from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering.blend import blend
 from pansplat.rendering.cpu.display import (
     NO_LAYER,
@@ -26,20 +27,9 @@ FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(FOV) / 2)
 
 @pytest.fixture(scope="module")
 def scene():
-    """600 Gaussians around the origin with two labels."""
-    from pansplat.gaussians.scene import Gaussians
-
-    random = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(600, 3, generator=random), dim=-1)
-    return Gaussians(
-        means=directions * (1 + 2 * torch.rand(600, 1, generator=random)),
-        scales=0.02 + 0.2 * torch.rand(600, 3, generator=random),
-        quats=torch.randn(600, 4, generator=random),
-        opacities=torch.rand(600, generator=random),
-        harmonics=0.3 * torch.randn(600, 4, 3, generator=random),
-        levels=torch.zeros(600, dtype=torch.int64),
-        views=torch.arange(600) % 2,
-    )
+    """600 Gaussians around the camera with two labels."""
+    scene = make_scene(600, scale=0.1, extent=1.3, degree=1).to(dtype=torch.float32)
+    return dataclasses.replace(scene, views=torch.arange(600) % 2)
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +41,7 @@ def display(scene):
 
 @pytest.fixture(scope="module")
 def pose():
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(torch.tensor((0.7, 0.3, -0.5, 0.2), dtype=torch.float64))
-    pose[:3, 3] = torch.tensor((0.1, -0.2, 0.05))
-    return pose
+    return POSE
 
 
 def draw(display, pose, labels, layers, selection=None):
