@@ -23,6 +23,7 @@ from pansplat.rendering.cuda.rasterize import (
     launch_constants,
     rasterize_backward_kernel,
     rasterize_kernel,
+    sum_gradients_kernel,
 )
 from pansplat.rendering.cuda.tiling import intersect_kernel
 
@@ -34,7 +35,7 @@ _FLOATS += ("grad_means", "grad_opacities", "grad_quats", "grad_scales")
 _DOUBLES = ("camera", "directions", "radii", "covariances", "grad_directions", "grad_radii")
 _DOUBLES += ("grad_covariances", "grad_camera")
 _TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
-_SIZES = ("TINY", "CHANNELS", "RECORD", "GRADIENT", "FIELDS", "BLOCK")
+_SIZES = ("TINY", "CHANNELS", "RECORD", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE", "DEGREE", "BLOCK")
 
 
 def _type(kernel, name: str) -> str:
@@ -70,8 +71,13 @@ def main() -> None:
             for name, kernel, warps in (("forward", rasterize_kernel, 2), ("backward", rasterize_backward_kernel, 1)):
                 sizes = launch_constants(records, warps) | gradient
                 _report(f"{name}, {channels} channels", kernel, int(sizes.pop("num_warps")), capability, **sizes)
-        _report("project", project_kernel, 4, capability, BLOCK=128)
-        _report("project backward", backpropagate_projection_kernel, 2, capability, BLOCK=64)
+        for group, at_once in ((16, 1), (1, 16)):
+            sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
+            _report(f"sum {group} x {at_once}", sum_gradients_kernel, 2, capability, **sizes)
+        sizes = dict(DEGREE=4, CHANNELS=3, BLOCK=128)
+        _report("project, degree 4", project_kernel, 4, capability, **sizes)
+        sizes |= dict(BLOCK=64)
+        _report("project backward", backpropagate_projection_kernel, 2, capability, **sizes)
         _report("intersect", intersect_kernel, 4, capability)
 
 

@@ -199,7 +199,11 @@ def intersect_tiles(
     ranges = tile_ranges(boxes[order], size, wraps)
     seen = torch.nonzero((ranges[:, 1] > 0) & (ranges[:, 3] > 0))[:, 0]
     order, (first_column, num_columns, first_row, num_rows) = order[seen], ranges[seen].unbind(1)
-    for low, high in split_rows(count_in_rows(num_columns, first_row, num_rows, rows), limit):
+    # Count the intersections in each row of tiles, from differences at the boxes' ends.
+    change = torch.zeros(rows + 1, dtype=torch.int64, device=boxes.device)
+    change.index_add_(0, first_row, num_columns)
+    change.index_add_(0, first_row + num_rows, -num_columns)
+    for low, high in split_rows(change.cumsum(0)[:rows].tolist(), limit):
         top = first_row.clamp_min(low)
         count = (torch.minimum(first_row + num_rows, torch.as_tensor(high)) - top).clamp_min(0) * num_columns
         inside = torch.repeat_interleave(torch.arange(len(order), device=boxes.device), count)
@@ -243,16 +247,6 @@ def tile_ranges(
         num_x = last_x.clamp(0, width - 1).long() // tile_size - first_x + 1
     ranges = torch.stack((first_x, num_x, first_y, last_y - first_y + 1), dim=1)
     return torch.where(hidden[:, None], torch.zeros_like(ranges), ranges)
-
-
-def count_in_rows(
-    num_columns: Int[Tensor, "n"], first_row: Int[Tensor, "n"], num_rows: Int[Tensor, "n"], rows: int
-) -> list[int]:
-    """Count the intersections in each row of tiles, from differences at the boxes' ends."""
-    change = torch.zeros(rows + 1, dtype=torch.int64, device=first_row.device)
-    change.index_add_(0, first_row, num_columns)
-    change.index_add_(0, first_row + num_rows, -num_columns)
-    return change.cumsum(0)[:rows].tolist()  # type: ignore[no-any-return]
 
 
 def split_rows(per_row: list[int], limit: int) -> Iterator[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""Projection of Gaussians: the geometry in one kernel, the colours by torch.
+"""Projection of Gaussians in one kernel.
 
 Source: docs/rendering.md, sections 1 to 3; `pansplat.rendering.projection.project_gaussians` is its reference. The
 kernel moves a third of a kilobyte for each Gaussian; the same arithmetic in torch operations moves 7 kB. Geometry is
@@ -7,7 +7,6 @@ float64 for Gaussians of any type.
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
 import math
-from collections.abc import Iterator
 from typing import Any, no_type_check
 
 import torch
@@ -17,7 +16,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.constants import MIN_COMPENSATION
-from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.rendering.projection import ProjectedGaussians
 
 # --- vectors and symmetric matrices (xx, xy, xz, yy, yz, zz) as tuples of blocks; a camera is cam2world, row by row ---
@@ -183,26 +181,67 @@ def rotate_to_frame(c, u, v, n):
     )
 
 
-# --- colours, by torch ---
-
-_CHUNK_SIZE = 1 << 18
-"""Gaussians whose colours torch computes together, up to 2 kB each with gradients."""
+# --- spherical harmonics ---
 
 
-def evaluate_colours(
-    directions: Float[Tensor, "n 3"], harmonics: Float[Tensor, "n k channel"]
-) -> Float[Tensor, "n channel"]:
-    """As `evaluate_harmonics`, whose matrix product is slow on CUDA."""
-    basis = harmonics_basis(directions, math.isqrt(harmonics.shape[1]) - 1)
-    return torch.relu((basis[:, :, None] * harmonics).sum(dim=1) + 0.5)
+def _norm(rational: float) -> tl.constexpr:
+    return tl.constexpr(math.sqrt(rational / math.pi))
 
 
-def list_chunks(means: Float[Tensor, "n 3"], cam2world: Float[Tensor, "4 4"]) -> Iterator[tuple[slice, Tensor]]:
-    """Ranges of Gaussians, and the directions (n 3) from the camera to their means, world axes."""
-    for low in range(0, len(means), _CHUNK_SIZE):
-        chunk = slice(low, low + _CHUNK_SIZE)
-        offsets = means[chunk].double() - cam2world[:3, 3]
-        yield chunk, torch.nn.functional.normalize(offsets, dim=1).to(means.dtype)
+_FLAT: tl.constexpr = _norm(0.25)
+_LINEAR: tl.constexpr = _norm(0.75)
+_SQUARE: tl.constexpr = _norm(3.75)
+_SQUARE_M0: tl.constexpr = _norm(0.3125)
+_CUBE_M0: tl.constexpr = _norm(0.4375)
+_CUBE_M1: tl.constexpr = _norm(0.65625)
+_CUBE_M2: tl.constexpr = _norm(26.25)
+_CUBE_M3: tl.constexpr = _norm(1.09375)
+_FOURTH_M0: tl.constexpr = _norm(0.03515625)
+_FOURTH_M1: tl.constexpr = _norm(1.40625)
+_FOURTH_M2: tl.constexpr = _norm(2.8125)
+_FOURTH_M3: tl.constexpr = _norm(9.84375)
+_FOURTH_M4: tl.constexpr = _norm(19.6875)
+
+
+@triton.jit
+@no_type_check
+def harmonics_basis(x, y, z, DEGREE: tl.constexpr):
+    """Harmonics of degree 0 to DEGREE at unit directions, (DEGREE + 1)^2 blocks in a tuple."""
+    xx, yy, zz = x * x, y * y, z * z
+    basis = (x * 0 + _FLAT,)
+    if DEGREE >= 1:
+        basis = basis + (-y * _LINEAR, z * _LINEAR, -x * _LINEAR)
+    if DEGREE >= 2:
+        basis = basis + (
+            x * y * _SQUARE,
+            -y * z * _SQUARE,
+            (2 * zz - xx - yy) * _SQUARE_M0,
+            -x * z * _SQUARE,
+            (xx - yy) * (0.5 * _SQUARE),
+        )
+    if DEGREE >= 3:
+        basis = basis + (
+            -y * (3 * xx - yy) * _CUBE_M3,
+            x * y * z * _CUBE_M2,
+            -y * (4 * zz - xx - yy) * _CUBE_M1,
+            z * (2 * zz - 3 * xx - 3 * yy) * _CUBE_M0,
+            -x * (4 * zz - xx - yy) * _CUBE_M1,
+            z * (xx - yy) * (0.5 * _CUBE_M2),
+            -x * (xx - 3 * yy) * _CUBE_M3,
+        )
+    if DEGREE >= 4:
+        basis = basis + (
+            x * y * (xx - yy) * _FOURTH_M4,
+            -y * z * (3 * xx - yy) * _FOURTH_M3,
+            x * y * (7 * zz - 1) * _FOURTH_M2,
+            -y * z * (7 * zz - 3) * _FOURTH_M1,
+            (zz * (35 * zz - 30) + 3) * _FOURTH_M0,
+            -x * z * (7 * zz - 3) * _FOURTH_M1,
+            (xx - yy) * (7 * zz - 1) * (0.5 * _FOURTH_M2),
+            -x * z * (xx - 3 * yy) * _FOURTH_M3,
+            (xx * (xx - 3 * yy) - yy * (3 * xx - yy)) * (0.25 * _FOURTH_M4),
+        )
+    return basis
 
 
 # --- the kernel ---
@@ -236,10 +275,11 @@ def compute_ray_rows(c, right, down, direction, e2, det):
 @triton.jit(do_not_specialize=["num"])
 @no_type_check
 def project_kernel(
-    means, opacities, quats, scales, camera, directions, radii, covariances, peaks, rows, radial_variances, num,
-    BLOCK: tl.constexpr,
+    means, opacities, harmonics, quats, scales, camera,
+    directions, radii, covariances, peaks, values, rows, radial_variances, num,
+    DEGREE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):
-    """Write the fields of `ProjectedGaussians` but the values. `camera` is cam2world, row by row, then e^2."""
+    """Write the fields of `ProjectedGaussians`. `camera` is cam2world, row by row, then e^2."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = index < num
     pose = load_numbers(camera, 17)
@@ -263,6 +303,16 @@ def project_kernel(
     store_fields(covariances, index, mask, (xx, xy, xz, xy, yy, yz, xz, yz, zz), 9)
     store_fields(directions, index, mask, direction, 3)
     tl.store(radii + index, radius, mask=mask)
+    dtype = values.dtype.element_ty
+    basis = harmonics_basis(world[0].to(dtype), world[1].to(dtype), world[2].to(dtype), DEGREE)
+    TERMS: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
+    for channel in tl.static_range(CHANNELS):
+        colour = radius.to(dtype) * 0 + 0.5
+        for k in tl.static_range(TERMS):
+            place = (index * TERMS + k) * CHANNELS + channel
+            colour += basis[k] * tl.load(harmonics + place, mask=mask, other=0.0)
+        tl.store(values + index * (CHANNELS + 1) + channel, tl.maximum(colour, 0.0), mask=mask)
+    tl.store(values + index * (CHANNELS + 1) + CHANNELS, radius, mask=mask)
 # fmt: on
 
 
@@ -275,7 +325,7 @@ def project_forward(
         fields: means, opacities, harmonics, quats, scales; all contiguous.
     """
     means, opacities, harmonics, quats, scales = fields
-    count, _, channels = harmonics.shape
+    count, terms, channels = harmonics.shape
     camera = torch.nn.functional.pad(cam2world.reshape(-1), (0, 1), value=filter_variance)
     double: Any = dict(dtype=torch.float64, device=means.device)
     out = ProjectedGaussians(
@@ -289,10 +339,8 @@ def project_forward(
     )
     if count:
         project_kernel[(triton.cdiv(count, _BLOCK_SIZE),)](
-            means, opacities, quats, scales, camera, out.direction, out.radius, out.covariance, out.peak, out.rows,
-            out.radial_variance, count, BLOCK=_BLOCK_SIZE, num_warps=4,
+            means, opacities, harmonics, quats, scales, camera, out.direction, out.radius,
+            out.covariance, out.peak, out.values, out.rows, out.radial_variance, count,
+            DEGREE=round(terms**0.5) - 1, CHANNELS=channels, BLOCK=_BLOCK_SIZE, num_warps=4,
         )  # fmt: skip
-    for chunk, directions in list_chunks(means, cam2world):
-        out.values[chunk, :-1] = evaluate_colours(directions, harmonics[chunk])
-    out.values[:, -1] = out.radius
     return out

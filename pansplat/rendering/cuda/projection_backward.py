@@ -7,6 +7,7 @@ motions.
 """
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
+import math
 from typing import no_type_check
 
 import torch
@@ -15,11 +16,10 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from pansplat.gaussians.harmonics import harmonics_basis
 from pansplat.rendering.cuda.projection import (
     MIN_RATIO,
     dot,
-    evaluate_colours,
-    list_chunks,
     load_fields,
     load_numbers,
     multiply,
@@ -36,6 +36,9 @@ from pansplat.rendering.projection import ProjectedGaussians
 
 _BLOCK_SIZE = 64
 """Gaussians of one program. A program sums its gradients of the pose; torch sums over programs."""
+
+_CHUNK_SIZE = 1 << 18
+"""Gaussians whose colours torch differentiates together, up to 2 kB each."""
 
 
 @triton.jit
@@ -293,11 +296,16 @@ def _backpropagate_colours(
 ) -> tuple[Float[Tensor, "n k channel"], Float[Tensor, "n 3"]]:
     """Gradients of the harmonics, and of the directions in world axes."""
     grad_harmonics, grad_world_directions = torch.empty_like(harmonics), torch.empty_like(means)
-    for chunk, directions in list_chunks(means, cam2world):
-        leaves = directions.requires_grad_(), harmonics[chunk].detach().requires_grad_()
+    degree = math.isqrt(harmonics.shape[1]) - 1
+    for low in range(0, len(means), _CHUNK_SIZE):
+        chunk = slice(low, low + _CHUNK_SIZE)
+        world = torch.nn.functional.normalize(means[chunk].double() - cam2world[:3, 3], dim=1).to(means.dtype)
+        leaves = harmonics[chunk].detach().requires_grad_(), world.requires_grad_()
         with torch.enable_grad():
-            colours = evaluate_colours(*leaves)
-        grad_world_directions[chunk], grad_harmonics[chunk] = torch.autograd.grad(
+            # As `evaluate_harmonics`, whose matrix product is slow on CUDA.
+            basis = harmonics_basis(leaves[1], degree)
+            colours = torch.relu((basis[:, :, None] * leaves[0]).sum(dim=1) + 0.5)
+        grad_harmonics[chunk], grad_world_directions[chunk] = torch.autograd.grad(
             colours, leaves, grad_colours[chunk], materialize_grads=True
         )
     return grad_harmonics, grad_world_directions

@@ -239,6 +239,10 @@ def launch_constants(records: Float[Tensor, "n record"], warps: int) -> dict[str
     return dict(TINY=torch.finfo(records.dtype).eps ** 0.5, CHANNELS=channels, RECORD=size, num_warps=warps)
 
 
+_MANY_TILES = 32
+"""An instance with more tiles has its own program in the sum over tiles."""
+
+
 # fmt: off
 @triton.jit(do_not_specialize=["first_tile", "columns", "tiles", "height", "width"])
 @no_type_check
@@ -307,6 +311,32 @@ def sum_row_gradients(grad_rows, delta):
     return sums
 
 
+# fmt: off
+@triton.jit(do_not_specialize=["num"])
+@no_type_check
+def sum_gradients_kernel(
+    gradients, ends, instances, totals, num,
+    GRADIENT: tl.constexpr, FIELDS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr,
+):
+    """Add the gradient records of an instance's tiles to its total."""
+    group = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
+    instance = tl.load(instances + group, mask=group < num, other=0).to(tl.int64)
+    first = tl.load(ends + instance - 1, mask=(group < num) & (instance > 0), other=0)
+    count = tl.load(ends + instance, mask=group < num, other=0) - first
+    field = tl.arange(0, FIELDS)[None, None, :]
+    step = tl.arange(0, AT_ONCE)[None, :, None]
+    total = tl.zeros([GROUP, FIELDS], totals.dtype.element_ty)
+    for low in range(0, tl.max(count, axis=0), AT_ONCE):
+        row = (first[:, None, None] + low + step) * GRADIENT + field
+        mask = (low + step < count[:, None, None]) & (field < GRADIENT)
+        total += tl.sum(tl.load(gradients + row, mask=mask, other=0.0), axis=1)
+    field = tl.arange(0, FIELDS)[None, :]
+    place = totals + instance[:, None] * GRADIENT + field
+    mask = (group < num)[:, None] & (field < GRADIENT)
+    tl.store(place, tl.load(place, mask=mask, other=0.0) + total, mask=mask)
+# fmt: on
+
+
 def rasterize_backward(
     records: Float[Tensor, "n record"],
     intersections: TileIntersections,
@@ -334,7 +364,15 @@ def rasterize_backward(
         *launch_geometry(intersections, sums), **launch_constants(records, 1), GRADIENT=num, FIELDS=fields,
     )  # fmt: skip
     counts = intersections.ends.diff(prepend=intersections.ends.new_zeros(1))
-    totals += torch.segment_reduce(gradients, "sum", lengths=counts, axis=0)
+    few = torch.nonzero((counts > 0) & (counts <= _MANY_TILES))[:, 0].int()
+    many = torch.nonzero(counts > _MANY_TILES)[:, 0].int()
+    for selected, group, at_once in ((few, 16, 1), (many, 1, 16)):
+        if len(selected):
+            grid = (triton.cdiv(len(selected), group),)
+            sum_gradients_kernel[grid](
+                gradients, intersections.ends, selected, totals, len(selected),
+                GRADIENT=num, FIELDS=fields, GROUP=group, AT_ONCE=at_once, num_warps=2,
+            )  # fmt: skip
 
 
 def sum_by_record(totals: Float[Tensor, "m gradient"], instances: Instances, num: int) -> Float[Tensor, "n gradient"]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pansplat.rendering.image_planes import ImagePlane
-from pansplat.rendering.reference import count_in_rows, split_rows, tile_grid, tile_ranges
+from pansplat.rendering.reference import split_rows, tile_grid, tile_ranges
 
 TILE_SIZE = 16  # pixels
 
@@ -93,7 +93,7 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
     total = int((num_columns * num_rows).sum())
     bands = [(0, rows, total)]
     if total > limit or rows > most:
-        per_row = count_in_rows(num_columns, first_row, num_rows, rows)
+        per_row = _count_in_rows(num_columns, first_row, num_rows, rows)
         ends_of_bands = (
             (row, min(row + most, end)) for first, end in split_rows(per_row, limit) for row in range(first, end, most)
         )
@@ -114,6 +114,16 @@ def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> It
         numbers = torch.arange((high - low) * columns, dtype=torch.int32, device=ends.device)
         starts = torch.nn.functional.pad(torch.searchsorted(tiles.int(), numbers), (0, 1), value=total)
         yield TileIntersections((low, high), record_ids[slots], starts.int(), slots.int(), ends)
+
+
+def _count_in_rows(
+    num_columns: Int[Tensor, "m"], first_row: Int[Tensor, "m"], num_rows: Int[Tensor, "m"], rows: int
+) -> list[int]:
+    """Count the intersections in each row of tiles, from differences at the instances' ends."""
+    change = torch.zeros(rows + 1, dtype=torch.int64, device=first_row.device)
+    change.index_add_(0, first_row, num_columns)
+    change.index_add_(0, first_row + num_rows, -num_columns)
+    return change.cumsum(0)[:rows].tolist()  # type: ignore[no-any-return]
 
 
 @triton.jit(do_not_specialize=["num", "total", "low", "columns", "steps"])
