@@ -11,7 +11,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import torch
 import triton
 from triton import knobs
 from triton.backends.compiler import GPUTarget
@@ -20,7 +19,8 @@ from triton.compiler import ASTSource
 from pansplat.rendering.cuda.projection import project_kernel
 from pansplat.rendering.cuda.projection_backward import backpropagate_projection_kernel
 from pansplat.rendering.cuda.rasterize import (
-    launch_constants,
+    RecordLayout,
+    num_warps,
     rasterize_backward_kernel,
     rasterize_kernel,
     sum_gradients_kernel,
@@ -35,7 +35,8 @@ _FLOATS += ("grad_means", "grad_opacities", "grad_quats", "grad_scales")
 _DOUBLES = ("camera", "directions", "radii", "covariances", "grad_directions", "grad_radii")
 _DOUBLES += ("grad_covariances", "grad_camera")
 _TYPES = {"ends": "*i64", "tiles": "i32", **dict.fromkeys(_DOUBLES, "*fp64")}
-_SIZES = ("TINY", "CHANNELS", "RECORD", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE", "DEGREE", "BLOCK")
+_SIZES = ("TINY", "AXES", "CHANNELS", "RECORD", "PEAK", "GRADIENT", "FIELDS", "GROUP", "AT_ONCE")
+_SIZES += ("DEGREE", "EXACT", "BLOCK")
 
 
 def _type(kernel, name: str) -> str:
@@ -65,16 +66,21 @@ def _report(label: str, kernel, warps: int, capability: int, **sizes) -> None:
 
 def main() -> None:
     for capability in [int(text) for text in sys.argv[1:]] or [80, 90]:
-        for channels in (3, 8):
-            records = torch.empty(0, channels + 18)
-            gradient = dict(GRADIENT=channels + 15, FIELDS=triton.next_power_of_2(channels + 15))
-            for name, kernel, warps in (("forward", rasterize_kernel, 2), ("backward", rasterize_backward_kernel, 1)):
-                sizes = launch_constants(records, warps) | gradient
-                _report(f"{name}, {channels} channels", kernel, int(sizes.pop("num_warps")), capability, **sizes)
+        for exact in (True, False):
+            for channels in (3, 8) if exact else (3,):
+                layout = RecordLayout(exact, channels)
+                sizes = dict(
+                    TINY=3.5e-4, AXES=layout.axes, CHANNELS=channels, RECORD=layout.record_size,
+                    PEAK=layout.peak_column,
+                    GRADIENT=layout.gradient_size, FIELDS=triton.next_power_of_2(layout.gradient_size),
+                )  # fmt: skip
+                name = f"{'ray' if exact else 'ewa'}, {channels} channels"
+                _report(f"forward {name}", rasterize_kernel, num_warps(layout, 2), capability, **sizes)
+                _report(f"backward {name}", rasterize_backward_kernel, num_warps(layout, 1), capability, **sizes)
         for group, at_once in ((16, 1), (1, 16)):
             sizes = dict(GRADIENT=18, FIELDS=32, GROUP=group, AT_ONCE=at_once)
             _report(f"sum {group} x {at_once}", sum_gradients_kernel, 2, capability, **sizes)
-        sizes = dict(DEGREE=4, CHANNELS=3, BLOCK=128)
+        sizes = dict(DEGREE=4, CHANNELS=3, EXACT=True, BLOCK=128)
         _report("project, degree 4", project_kernel, 4, capability, **sizes)
         sizes |= dict(BLOCK=64)
         _report("project backward", backpropagate_projection_kernel, 2, capability, **sizes)

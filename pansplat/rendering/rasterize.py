@@ -128,13 +128,13 @@ def rasterize(
         cam2world: rigid pose, metres; differentiable.
         size: height and width of the image, pixels.
         layout: "equirect" has one ray for each pixel; "cubemap" stitches a panorama from six faces; "pinhole".
-        vertical_fov_degrees: vertical field of view of a pinhole image.
-        face_size: side of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
-        eye_offset: in layout "equirect", radius of the viewing circle of omni-directional stereo, metres, half the
+        vertical_fov_degrees: of a pinhole image.
+        face_size: of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
+        eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
             distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
-        backend: "torch" is the reference; fast for kernel "ray" are "numba" on a CPU (three channels) and "triton" on
-            CUDA; "auto" chooses the fastest available for the kernel, and the Gaussians' type, channels and device.
+        backend: "torch" is the reference, "numba" fast on a CPU (kernel "ray", three channels), "triton" on CUDA;
+            "auto" chooses the fastest available for the kernel, and the Gaussians' type, channels and device.
         kernel, near: see `RasterOptions`.
 
     Returns:
@@ -170,10 +170,10 @@ def _select_backend(name: Backend, gaussians: Gaussians, kernel: Kernel) -> Rast
     """Select the backend of this name; "auto" chooses by the kernel, and the Gaussians' type, channels and device."""
     if name == "auto":
         on_cpu = gaussians.means.device.type == "cpu"
-        has_numba = on_cpu and gaussians.harmonics.shape[2] == 3
-        available = has_numba or (gaussians.means.is_cuda and find_triton_problem() is None)
+        has_numba = on_cpu and kernel == "ray" and gaussians.harmonics.shape[2] == 3
+        available = has_numba if on_cpu else gaussians.means.is_cuda and find_triton_problem() is None
         fast: Backend = "numba" if on_cpu else "triton"
-        name = fast if available and kernel == "ray" and gaussians.means.dtype == torch.float32 else "torch"
+        name = fast if available and gaussians.means.dtype == torch.float32 else "torch"
     if name == "numba":
         from pansplat.rendering.cpu import rasterize_planes
     elif name == "triton":

@@ -258,8 +258,6 @@ def test_the_number_of_threads_changes_no_bit_of_image_or_gradients(
     kernel: str, layout: str, render: Renderer, run_with_threads: Callable
 ) -> None:
     """tests/rendering/cpu compares SIMD widths."""
-    if render.name == "triton" and kernel == "ewa":
-        pytest.skip("the fast backends have no EWA kernel")
     is_numba = render.name == "auto" and kernel == "ray"
     scene = make_scene(12 if render.interpreted else 20_000 if is_numba else 100, degree=1)
     options = {"kernel": kernel, "layout": "pinhole" if render.interpreted else layout, "face_size": 24}

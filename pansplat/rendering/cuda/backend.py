@@ -9,9 +9,11 @@ import os
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
+from pansplat.constants import EWA_NEAR_FACTOR
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import reference
@@ -20,6 +22,7 @@ from pansplat.rendering.projection import (
     Footprints,
     ProjectedGaussians,
     compute_footprints,
+    is_in_image,
     ray_footprints,
     select_drawable,
 )
@@ -37,8 +40,6 @@ def rasterize_planes(
     options: RasterOptions,
 ) -> Float[Tensor, "plane sums height width"]:
     """Rasterise with Triton kernels; see `pansplat.rendering.rasterize.RasterBackend`."""
-    if options.kernel != "ray":
-        raise InputError(f"backend 'triton' has kernel 'ray' only, got {options.kernel!r}; use backend='torch'")
     device = gaussians.means.device
     _check_device(device)
     if planes[0].eye_offset:  # stereo is too rare for kernels of its own
@@ -49,9 +50,10 @@ def rasterize_planes(
             select_drawable(gaussians, pose, options.near),
             pose,
             filter_variance=options.filter_variance(planes[0].pixel_angle),
+            exact=options.kernel == "ray",
         )
-        instances = _sort_instances(projected, planes, options)
-        return _Composite.apply(*ray_footprints(projected), instances, planes, torch.is_grad_enabled())
+        footprints, instances = _compute_instances(projected, planes, options)
+        return _composite(footprints, instances, planes, exact=options.kernel == "ray")
 
 
 def _check_device(device: torch.device) -> None:
@@ -67,46 +69,112 @@ def _check_device(device: torch.device) -> None:
 
 
 def project_gaussians(
-    gaussians: Gaussians, cam2world: Float[Tensor, "4 4"], *, filter_variance: float
+    gaussians: Gaussians,
+    cam2world: Float[Tensor, "4 4"],
+    *,
+    filter_variance: float,
+    exact: bool,
 ) -> ProjectedGaussians:
     """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`."""
     fields = (gaussians.means, gaussians.opacities, gaussians.harmonics, gaussians.quats, gaussians.scales)
-    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, *fields))
+    return ProjectedGaussians(*_Project.apply(cam2world, filter_variance, exact, *fields))
 
 
 class _Project(torch.autograd.Function):
     """Projection: one kernel forward, one backward."""
 
     @staticmethod
-    def forward(ctx: Any, cam2world: Tensor, filter_variance: float, *fields: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, cam2world: Tensor, filter_variance: float, exact: bool, *fields: Tensor
+    ) -> tuple[Tensor, ...]:
         from pansplat.rendering.cuda.projection import project_forward
 
         fields = tuple(field.contiguous() for field in fields)
         ctx.save_for_backward(cam2world, *fields)
-        ctx.filter_variance = filter_variance
-        return tuple(project_forward(cam2world, fields, filter_variance))
+        ctx.options = filter_variance, exact
+        return tuple(project_forward(cam2world, fields, filter_variance, exact=exact))
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         from pansplat.rendering.cuda.projection_backward import backpropagate_projection
 
         cam2world, *fields = ctx.saved_tensors
-        grads = ProjectedGaussians(*grad_outputs)
-        grad_pose, *grad_fields = backpropagate_projection(cam2world, fields, grads, ctx.filter_variance)
-        return grad_pose, None, *grad_fields
+        filter_variance, exact = ctx.options
+        grad_pose, *grad_fields = backpropagate_projection(
+            cam2world, fields, ProjectedGaussians(*grad_outputs), filter_variance, exact=exact
+        )
+        return grad_pose, None, None, *grad_fields
+
+
+def _compute_instances(
+    projected: ProjectedGaussians, planes: list[ImagePlane], options: RasterOptions
+) -> tuple[Footprints, "Instances"]:
+    """Compute footprints and their instances; all planes share the footprints of the exact kernel."""
+    from pansplat.rendering.cuda.tiling import sort_instances
+
+    fixed = ProjectedGaussians(*(field.detach() for field in projected))
+    boxes, keys, bases, parts, total = [], [], [], [], 0
+    for plane in planes:
+        key = fixed.radius
+        if options.kernel == "ewa":
+            key = (fixed.direction * plane.rotation[:, 2]).sum(dim=1) * fixed.radius
+            ahead = torch.nonzero(key > EWA_NEAR_FACTOR * options.near)[:, 0]
+            box = _compute_boxes(ProjectedGaussians(*(field[ahead] for field in fixed)), plane, options)
+            visible = is_in_image(box, plane)
+            seen, box = ahead[visible], box[visible]
+            part = ProjectedGaussians(*(_SelectRows.apply(field, seen) for field in projected))
+            parts.append(checkpoint(compute_footprints, part, plane, options, use_reentrant=False)[0])
+            bases.append(total)
+            total, key = total + len(seen), key[seen]
+        else:
+            box = _compute_boxes(fixed, plane, options)
+            bases.append(0)
+        boxes.append(box)
+        keys.append(key)
+    footprints = ray_footprints(projected)
+    if parts:
+        footprints = Footprints(*(torch.cat(field) for field in zip(*parts, strict=True)))
+    return footprints, sort_instances(boxes, keys, bases, planes[0].size, wraps=planes[0].is_panorama)
 
 
 @torch.no_grad()
-def _sort_instances(projected: ProjectedGaussians, planes: list[ImagePlane], options: RasterOptions) -> "Instances":
-    """The visible records of each image plane, front to back."""
-    from pansplat.rendering.cuda.tiling import sort_instances
+def _compute_boxes(projected: ProjectedGaussians, plane: ImagePlane, options: RasterOptions) -> Float[Tensor, "n 4"]:
+    return compute_footprints(projected, plane, options)[1]
 
-    boxes = [compute_footprints(projected, plane, options)[1] for plane in planes]
-    return sort_instances(boxes, projected.radius, planes[0].size, wraps=planes[0].is_panorama)
+
+class _SelectRows(torch.autograd.Function):
+    """Select rows of a tensor, each at most once, so that backward needs neither a sort nor atomics."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Int[Tensor, "m"]) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.shape = table.shape
+        return table[rows]
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        return grad_outputs[0].new_zeros(ctx.shape).index_copy_(0, rows, grad_outputs[0]), None
+
+
+def _composite(
+    footprints: Footprints, instances: "Instances", planes: list[ImagePlane], *, exact: bool
+) -> Float[Tensor, "plane sums height width"]:
+    """Sum weight x (values, 1) along the rays of all image planes.
+
+    Differentiable once in all of `footprints`.
+    """
+    from pansplat.rendering.cuda.rasterize import RecordLayout
+    from pansplat.rendering.cuda.tiling import tile_pixels
+
+    layout = RecordLayout(exact, footprints.values.shape[1] - 1)
+    pixels = tile_pixels(planes, exact=exact, dtype=footprints.rows.dtype)
+    setup = instances, pixels, layout, planes[0].size
+    return _Composite.apply(*footprints, setup, torch.is_grad_enabled())  # type: ignore[no-any-return]
 
 
 class _Composite(torch.autograd.Function):
-    """Sums of weight x (values, 1) along the rays of all image planes; backward uses what forward has made."""
+    """Compositing; backward uses the records, the intersections and the sums of forward."""
 
     @staticmethod
     def forward(
@@ -116,34 +184,33 @@ class _Composite(torch.autograd.Function):
         radial_variance: Tensor,
         peak: Tensor,
         values: Tensor,
-        instances: "Instances",
-        planes: list[ImagePlane],
+        setup: tuple[Any, ...],
         grad_enabled: bool,
     ) -> Tensor:
         from pansplat.rendering.cuda.rasterize import pack_records, rasterize
-        from pansplat.rendering.cuda.tiling import intersect_tiles, tile_pixels
+        from pansplat.rendering.cuda.tiling import intersect_tiles
 
-        records = pack_records(Footprints(point, rows, radial_variance, peak, values))
-        pixels = tile_pixels(planes, rows.dtype)
-        sums = records.new_empty(len(planes), values.shape[1] + 1, *planes[0].size)
+        instances, pixels, layout, size = setup
+        records = pack_records(Footprints(point, rows, radial_variance, peak, values), layout)
+        sums = records.new_empty(len(instances.planes), layout.channels + 2, *size)
         kept = []
         for band in intersect_tiles(instances):
-            stops = rasterize(records, band, pixels, sums)
+            stops = rasterize(records, band, pixels, sums, layout)
             if grad_enabled and any(ctx.needs_input_grad):  # needs_input_grad itself ignores no_grad
                 kept.append((band, stops))
         ctx.save_for_backward(records, rows, sums)
-        ctx.saved = instances, pixels, kept
+        ctx.setup, ctx.kept = setup, kept
         return sums
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
-        from pansplat.rendering.cuda.rasterize import gradient_size, rasterize_backward, sum_by_record, unpack_gradients
+        from pansplat.rendering.cuda.rasterize import rasterize_backward, sum_by_record, unpack_gradients
 
         if torch.is_grad_enabled():  # the caller chose create_graph=True
             raise RuntimeError("second derivatives of a rendering are not available; drop create_graph=True")
         records, rows, sums = ctx.saved_tensors
-        instances, pixels, kept = ctx.saved
-        totals = records.new_zeros(len(instances.records), gradient_size(records))
-        for band, stops in kept:
-            rasterize_backward(records, band, stops, pixels, sums, grad_outputs[0].contiguous(), totals)
-        return *unpack_gradients(sum_by_record(totals, instances, len(records)), rows), None, None, None
+        instances, pixels, layout, _ = ctx.setup
+        totals = records.new_zeros(len(instances.records), layout.gradient_size)
+        for band, stops in ctx.kept:
+            rasterize_backward(records, band, stops, pixels, sums, grad_outputs[0].contiguous(), layout, totals)
+        return *unpack_gradients(sum_by_record(totals, instances, len(records)), rows, layout), None, None

@@ -277,7 +277,7 @@ def compute_ray_rows(c, right, down, direction, e2, det):
 def project_kernel(
     means, opacities, harmonics, quats, scales, camera,
     directions, radii, covariances, peaks, values, rows, radial_variances, num,
-    DEGREE: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
+    DEGREE: tl.constexpr, CHANNELS: tl.constexpr, EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """Write the fields of `ProjectedGaussians`. `camera` is cam2world, row by row, then e^2."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -294,9 +294,10 @@ def project_kernel(
     c, minors = shape_from_axes(quats, scales, pose, radius, direction, index, mask)
     det = minors[0] + e2 * minors[1] + e2 * e2
     peak = tl.load(opacities + index, mask=mask, other=0.0).to(tl.float64)
-    peak = peak * tl.sqrt(tl.maximum(minors[0] / det, MIN_RATIO))
-    tl.store(radial_variances + index, (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det, mask=mask)
-    store_fields(rows, index, mask, compute_ray_rows(c, right, down, direction, e2, det), 9)
+    if EXACT:
+        peak = peak * tl.sqrt(tl.maximum(minors[0] / det, MIN_RATIO))
+        tl.store(radial_variances + index, (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det, mask=mask)
+        store_fields(rows, index, mask, compute_ray_rows(c, right, down, direction, e2, det), 9)
     tl.store(peaks + index, peak, mask=mask)
     xx, xy, xz = c[0] + e2 * (1 - x * x), c[1] - e2 * x * y, c[2] - e2 * x * z
     yy, yz, zz = c[3] + e2 * (1 - y * y), c[4] - e2 * y * z, c[5] + e2 * (1 - z * z)
@@ -317,7 +318,11 @@ def project_kernel(
 
 
 def project_forward(
-    cam2world: Float[Tensor, "4 4"], fields: tuple[Tensor, ...], filter_variance: float
+    cam2world: Float[Tensor, "4 4"],
+    fields: tuple[Tensor, ...],
+    filter_variance: float,
+    *,
+    exact: bool,
 ) -> ProjectedGaussians:
     """Project Gaussians; see `pansplat.rendering.projection.project_gaussians`.
 
@@ -334,13 +339,13 @@ def project_forward(
         covariance=torch.empty(count, 3, 3, **double),
         peak=torch.empty_like(opacities),
         values=means.new_empty(count, channels + 1),
-        rows=means.new_empty(count, 3, 3),
-        radial_variance=torch.empty_like(opacities),
+        rows=means.new_empty(count, 3 if exact else 0, 3),
+        radial_variance=torch.zeros_like(opacities),
     )
     if count:
         project_kernel[(triton.cdiv(count, _BLOCK_SIZE),)](
             means, opacities, harmonics, quats, scales, camera, out.direction, out.radius,
             out.covariance, out.peak, out.values, out.rows, out.radial_variance, count,
-            DEGREE=round(terms**0.5) - 1, CHANNELS=channels, BLOCK=_BLOCK_SIZE, num_warps=4,
+            DEGREE=round(terms**0.5) - 1, CHANNELS=channels, EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=4,
         )  # fmt: skip
     return out

@@ -111,31 +111,39 @@ def backpropagate_quats(grad_axes, quats, index, mask):
 
 @triton.jit
 @no_type_check
-def backpropagate_shape(c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad_s):
+def backpropagate_shape(
+    c_uvn, minors, frame, e2, opacity, grad_peak, grad_rows, grad_radial_variance, EXACT: tl.constexpr
+):
     """Gradients of C's six entries, of the rotations of n towards u and v, and of the opacity.
 
     Args:
         c_uvn: C in the tangent frame, before the filter.
         minors: det B, tr B, g, M, det C.
         frame: u, v, n.
-        opacity: opacity before the filter.
-        grad_s: gradient of the radial variance.
+        opacity: before the filter.
+        grad_rows, grad_radial_variance: only read for the exact kernel.
     """
     det = minors[0] + e2 * minors[1] + e2 * e2
-    g, grad_det, turn_u, turn_v = backpropagate_rows(grad_rows, frame, c_uvn, e2, det)
-    radial_variance = (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det
-    ratio = minors[0] / det
-    root = tl.sqrt(tl.maximum(ratio, MIN_RATIO))
-    grad_ratio = tl.where(ratio >= MIN_RATIO, 0.5 * grad_peak * opacity / root, 0.0)
-    grad_det -= grad_s * radial_variance / det + grad_ratio * ratio / det
-    grad_minors = (
-        grad_ratio / det + grad_det, e2 * grad_det, e2 * e2 * grad_s / det, e2 * grad_s / det, grad_s / det
-    )  # fmt: skip
+    zero = det * 0
+    g, grad_det, turn_u, turn_v = (zero, zero, zero, zero, zero), zero, zero, zero
+    grad_minors = (zero, zero, zero, zero, zero)
+    if EXACT:
+        g, grad_det, turn_u, turn_v = backpropagate_rows(grad_rows, frame, c_uvn, e2, det)
+        radial_variance = (e2 * e2 * minors[2] + e2 * minors[3] + minors[4]) / det
+        grad_s = grad_radial_variance
+        grad_det -= grad_s * radial_variance / det
+        ratio = minors[0] / det
+        root = tl.sqrt(tl.maximum(ratio, MIN_RATIO))
+        grad_ratio = tl.where(ratio >= MIN_RATIO, 0.5 * grad_peak * opacity / root, 0.0)
+        grad_minors = (grad_ratio / det, zero, e2 * e2 * grad_s / det, e2 * grad_s / det, grad_s / det)
+        grad_det -= grad_ratio * ratio / det
+        grad_peak = grad_peak * root
+    grad_minors = (grad_minors[0] + grad_det, e2 * grad_det, grad_minors[2], grad_minors[3], grad_minors[4])
     m = backpropagate_minors(grad_minors, c_uvn)
     uu, uv, un, vv, vn, nn = g[0] + m[0], g[1] + m[1], g[2] + m[2], g[3] + m[3], g[4] + m[4], m[5]
     turn_u += 2 * (nn - uu) * c_uvn[2] + un * (c_uvn[0] - c_uvn[5]) + vn * c_uvn[1] - uv * c_uvn[4]
     turn_v += 2 * (nn - vv) * c_uvn[4] + vn * (c_uvn[3] - c_uvn[5]) + un * c_uvn[1] - uv * c_uvn[2]
-    return (uu, uv, un, vv, vn, nn), turn_u, turn_v, grad_peak * root
+    return (uu, uv, un, vv, vn, nn), turn_u, turn_v, grad_peak
 
 
 @triton.jit
@@ -204,7 +212,7 @@ def backpropagate_projection_kernel(
     means, opacities, quats, scales, camera,
     grad_world_directions, grad_directions, grad_radii, grad_covariances, grad_peaks, grad_rows, grad_radial_variances,
     grad_means, grad_opacities, grad_quats, grad_scales, grad_camera, num,
-    BLOCK: tl.constexpr,
+    EXACT: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """Write the gradients of the geometry; `grad_world_directions` are those of the colours."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -222,7 +230,8 @@ def backpropagate_projection_kernel(
     grad_shape, turn_u, turn_v, grad_opacity = backpropagate_shape(
         c_uvn, minors, (u, v, n), e2,
         load_fields(opacities, index, mask, 1)[0], load_fields(grad_peaks, index, mask, 1)[0],
-        load_fields(grad_rows, index, mask, 9), load_fields(grad_radial_variances, index, mask, 1)[0],
+        load_fields(grad_rows, index, mask, 9 if EXACT else 0), load_fields(grad_radial_variances, index, mask, 1)[0],
+        EXACT,
     )  # fmt: skip
     tl.store(grad_opacities + index, grad_opacity, mask=mask)
     grad_n = load_fields(grad_directions, index, mask, 3)
@@ -256,14 +265,16 @@ def backpropagate_projection(
     fields: list[Tensor],
     grads: ProjectedGaussians,
     filter_variance: float,
+    *,
+    exact: bool,
 ) -> tuple[Tensor, ...]:
     """Compute the gradient of the pose, then those of the fields.
 
     Args:
         cam2world: float64.
         fields: means, opacities, harmonics, quats, scales.
-        grads: gradients of the projected Gaussians.
-        filter_variance: see `pansplat.rendering.projection.project_gaussians`.
+        grads: of the projected Gaussians.
+        filter_variance, exact: see `pansplat.rendering.projection.project_gaussians`.
     """
     means, opacities, harmonics, quats, scales = fields
     count = len(means)
@@ -282,7 +293,7 @@ def backpropagate_projection(
         grads.covariance.contiguous(), grads.peak.contiguous(), grads.rows.contiguous(),
         grads.radial_variance.contiguous(),
         grad_fields[0], grad_fields[1], grad_fields[3], grad_fields[4], parts, count,
-        BLOCK=_BLOCK_SIZE, num_warps=2,
+        EXACT=exact, BLOCK=_BLOCK_SIZE, num_warps=2,
     )  # fmt: skip
     grad_camera[:3] = parts.sum(dim=0)
     return grad_camera, *grad_fields

@@ -1,21 +1,22 @@
 """Compositing of tiles and its gradients: the Triton kernels and their launches.
 
-Source: docs/rendering.md, sections 3 and 4.
+Source: docs/rendering.md, sections 3 and 4. An image plane's points have `axes` coordinates: three for the exact kernel
+(directions), two for EWA (pixels). Both have as many footprint rows.
 
 A record holds the numbers of one footprint that a tile reads:
 
-    point               3               the footprint's point, rounded to the records' type
-    residual            3               of that rounding, so that differences to a tile's centre keep their digits
-    rows                3 x 3           a, b and l
-    radial variance     1
+    point               axes            the footprint's point, rounded to the records' type
+    residual            axes            of that rounding, so that differences to a tile's centre keep their digits
+    rows                axes x axes     a, b and, if exact, l
+    radial variance     1 if exact
     peak                1
     values              channels + 1    colours, then the distance
 
 A gradient record holds sums over the pixels of one tile:
 
-    rows                3 x 3           gradient of each row's value, times (pixel - point)
-    row values          3               gradient of each row's value
-    radial variance     1
+    rows                axes x axes     gradient of each row's value, times (pixel - point)
+    row values          axes            gradient of each row's value
+    radial variance     1 if exact
     peak                1
     values              channels + 1
 
@@ -26,6 +27,7 @@ saturation once in 32 records, because the test synchronises all threads. docs/t
 """
 # ruff: noqa: RUF005  # Triton does not unpack into a tuple
 
+from dataclasses import dataclass
 from typing import no_type_check
 
 import torch
@@ -40,29 +42,63 @@ from pansplat.rendering.cuda.tiling import TILE_SIZE, Instances, TileIntersectio
 from pansplat.rendering.projection import Footprints
 from pansplat.rendering.reference import tile_grid
 
-PEAK: tl.constexpr = tl.constexpr(16)
-"""Column of the peak in a record, after the radial variance and before the values."""
+
+@dataclass(frozen=True)
+class RecordLayout:
+    """Sizes of records and gradient records.
+
+    Attributes:
+        exact: the exact kernel, or EWA.
+        channels: colours, without the distance.
+    """
+
+    exact: bool
+    channels: int
+
+    @property
+    def axes(self) -> int:
+        """Coordinates of a point, and rows of a footprint."""
+        return 3 if self.exact else 2
+
+    @property
+    def peak_column(self) -> int:
+        """Column of the peak in a record: before the values."""
+        return (2 + self.axes) * self.axes + int(self.exact)
+
+    @property
+    def record_size(self) -> int:
+        """Numbers in a record."""
+        return self.peak_column + 1 + self.channels + 1
+
+    @property
+    def gradient_size(self) -> int:
+        """Numbers in a gradient record."""
+        return self.axes * (self.axes + 1) + int(self.exact) + 1 + self.channels + 1
 
 
-def gradient_size(records: Float[Tensor, "n record"]) -> int:
-    """Numbers in a gradient record: the point and its residual have the sums of the three rows' values."""
-    return records.shape[1] - 3
-
-
-def pack_records(footprints: Footprints) -> Float[Tensor, "n record"]:
+def pack_records(footprints: Footprints, layout: RecordLayout) -> Float[Tensor, "n record"]:
     """Pack footprints into records, in the type of their rows."""
-    dtype, point = footprints.rows.dtype, footprints.point.double()
+    dtype = footprints.rows.dtype
+    point = footprints.point[:, : layout.axes].double()
     rounded = point.to(dtype)
+    rows = footprints.rows[:, : layout.axes, : layout.axes].flatten(1)
+    radial_variance = [footprints.radial_variance[:, None]] if layout.exact else []
     residual = (point - rounded.double()).to(dtype)
-    numbers = footprints.radial_variance[:, None], footprints.peak[:, None], footprints.values
-    return torch.cat((rounded, residual, footprints.rows.flatten(1), *numbers), dim=1).contiguous()
+    parts = (rounded, residual, rows, *radial_variance, footprints.peak[:, None], footprints.values)
+    return torch.cat(parts, dim=1).contiguous()
 
 
-def unpack_gradients(gradient: Float[Tensor, "n gradient"], rows: Float[Tensor, "n 3 3"]) -> Footprints:
+def unpack_gradients(
+    gradient: Float[Tensor, "n gradient"], rows: Float[Tensor, "n 3 3"], layout: RecordLayout
+) -> Footprints:
     """Compute the gradients of footprints from their rows and from gradient records summed over tiles."""
-    row_sums, value_sums, numbers, values = gradient.split((9, 3, 2, gradient.shape[1] - 14), dim=1)
-    grad_point = -(value_sums.double()[:, :, None] * rows.double()).sum(dim=1)
-    return Footprints(grad_point, row_sums.view_as(rows), numbers[:, 0], numbers[:, 1], values)
+    axes, channels = layout.axes, layout.channels
+    row_sums, value_sums, rest = gradient.split((axes * axes, axes, gradient.shape[1] - axes * (axes + 1)), dim=1)
+    grad_rows = torch.zeros_like(rows)
+    grad_rows[:, :axes, :axes] = row_sums.view(-1, axes, axes)
+    grad_point = -(value_sums.double()[:, :, None] * rows[:, :axes].double()).sum(dim=1)
+    radial_variance = rest[:, 0] if layout.exact else torch.zeros_like(rest[:, 0])
+    return Footprints(grad_point, grad_rows, radial_variance, rest[:, -channels - 2], rest[:, -channels - 1 :])
 
 
 _SIDE: tl.constexpr = tl.constexpr(TILE_SIZE)
@@ -90,38 +126,41 @@ def load_rows(pointer, stride, index, NUM: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def evaluate_rows(record, centre, offsets):
+def evaluate_rows(record, centre, offsets, AXES: tl.constexpr):
     """Compute the pixels relative to a footprint's point, and the values of its rows there.
 
     Args:
-        centre: the tile's centre, and the residual of its rounding.
+        centre: of the tile, and the residual of its rounding.
         offsets: pixels relative to the centre.
     """
     delta = ()
-    for k in tl.static_range(3):
+    for k in tl.static_range(AXES):
         # Both differences are exact or tiny, so rounding loses no digits of the pixel.
-        point = (record[k] - centre[k]) + (record[3 + k] - centre[3 + k])
+        point = (record[k] - centre[k]) + (record[AXES + k] - centre[AXES + k])
         delta = delta + (offsets[k] - point,)
     rows = ()
-    for f in tl.static_range(3):
-        value = record[6 + 3 * f] * delta[0]
-        for k in tl.static_range(1, 3):
-            value += record[6 + 3 * f + k] * delta[k]
+    for f in tl.static_range(AXES):
+        value = record[(2 + f) * AXES] * delta[0]
+        for k in tl.static_range(1, AXES):
+            value += record[(2 + f) * AXES + k] * delta[k]
         rows = rows + (value,)
     return delta, rows
 
 
 @triton.jit
 @no_type_check
-def evaluate_response(rows, radial_variance, TINY: tl.constexpr):
-    """Evaluate exp(-q / 2) at pixels (0 where L <= 0), Q, L, and the divisor of Q in q."""
+def evaluate_response(rows, radial_variance, TINY: tl.constexpr, AXES: tl.constexpr):
+    """Evaluate exp(-q / 2) at pixels (0 where L <= 0); for the exact kernel also Q, L, and the divisor of Q in q."""
     square = rows[0] * rows[0] + rows[1] * rows[1]
-    ahead = 1 + rows[2]
-    # The bound has an effect only near the plane L = 0; it keeps gradients finite there.
-    bounded = tl.maximum(ahead, TINY)
-    divisor = bounded * bounded + radial_variance * square
-    falloff = tl.where(ahead > 0, tl.exp2((square / divisor) * _MINUS_HALF_LOG2_E), 0.0)
-    return falloff, square, ahead, divisor
+    if AXES == 3:
+        ahead = 1 + rows[2]
+        # The bound has an effect only near the plane L = 0; it keeps gradients finite there.
+        bounded = tl.maximum(ahead, TINY)
+        divisor = bounded * bounded + radial_variance * square
+        falloff = tl.where(ahead > 0, tl.exp2((square / divisor) * _MINUS_HALF_LOG2_E), 0.0)
+        return falloff, square, ahead, divisor
+    else:
+        return tl.exp2(square * _MINUS_HALF_LOG2_E), square, square, square
 
 
 @triton.jit
@@ -152,14 +191,14 @@ def locate_pixels(tile, pixel, columns, tiles, height, width, SUMS: tl.constexpr
 @no_type_check
 def rasterize_kernel(
     records, record_ids, starts, tile_order, centres, offsets, sums, stops, first_tile, columns, tiles, height, width,
-    TINY: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr,
+    TINY: tl.constexpr, AXES: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr, PEAK: tl.constexpr,
 ):
     """Write the sums of weight x (channels, distance, 1), and the position of the stop; one program for each tile."""
     local = tl.load(tile_order + tl.program_id(0)).to(tl.int64)
     tile = first_tile + local
     pixel = tl.arange(0, _PIXELS)
-    centre = load_numbers(centres + tile * 6, 6)
-    offset = load_rows(offsets + tile * 3 * _PIXELS, _PIXELS, pixel, 3)
+    centre = load_numbers(centres + tile * 2 * AXES, 2 * AXES)
+    offset = load_rows(offsets + tile * AXES * _PIXELS, _PIXELS, pixel, AXES)
     transmittance = tl.full([_PIXELS], 1, records.dtype.element_ty)
     totals = ()
     for _ in tl.static_range(CHANNELS + 2):
@@ -170,8 +209,8 @@ def rasterize_kernel(
         step_end = tl.minimum(position + _STEP, end)
         for at in range(position, step_end):
             record = load_numbers(records + tl.load(record_ids + at).to(tl.int64) * RECORD, RECORD)
-            rows = evaluate_rows(record, centre, offset)[1]
-            weight = clamp_alpha(record[PEAK] * evaluate_response(rows, record[PEAK - 1], TINY)[0])
+            rows = evaluate_rows(record, centre, offset, AXES)[1]
+            weight = clamp_alpha(record[PEAK] * evaluate_response(rows, record[PEAK - 1], TINY, AXES)[0])
             weight, transmittance = weight * transmittance, transmittance - weight * transmittance
             added = ()
             for c in tl.static_range(CHANNELS + 1):
@@ -190,13 +229,14 @@ def rasterize(
     intersections: TileIntersections,
     pixels: TilePixels,
     sums: Float[Tensor, "plane sums height width"],
+    layout: RecordLayout,
 ) -> Int[Tensor, "tile"]:
     """Composite the tiles of `intersections` into `sums`.
 
     Args:
-        intersections: intersections of one band of tile rows.
-        pixels: pixels of all planes.
-        sums: sums of all planes; the tiles' pixels are overwritten.
+        intersections: of one band of tile rows.
+        pixels: of all planes.
+        sums: of all planes; the tiles' pixels are overwritten.
 
     Returns:
         For each tile, the position in `record_ids` at which it stopped.
@@ -206,7 +246,7 @@ def rasterize(
     rasterize_kernel[(tiles,)](
         records, intersections.record_ids, intersections.starts, sort_tiles_by_load(intersections), pixels.centres,
         pixels.offsets, sums, stops,
-        *launch_geometry(intersections, sums), **launch_constants(records, 2),
+        *launch_geometry(intersections, sums), **launch_constants(records, layout), num_warps=num_warps(layout, 2),
     )  # fmt: skip
     return stops
 
@@ -225,18 +265,16 @@ def launch_geometry(
     return intersections.rows[0] * columns, columns, rows * columns, height, width
 
 
-def launch_constants(records: Float[Tensor, "n record"], warps: int) -> dict[str, int | float]:
-    """Compile-time constants of the kernels, TINY the lower bound of L, and the number of warps for each tile.
+def launch_constants(records: Float[Tensor, "n record"], layout: RecordLayout) -> dict[str, int | float]:
+    """Compile-time constants of the kernels; TINY is the lower bound of L."""
+    tiny = torch.finfo(records.dtype).eps ** 0.5
+    record = dict(RECORD=layout.record_size, PEAK=layout.peak_column)
+    return dict(TINY=tiny, AXES=layout.axes, CHANNELS=layout.channels, **record)
 
-    With more channels a thread has fewer pixels, so that all sums stay in registers.
 
-    Args:
-        warps: warps for up to four channels.
-    """
-    size = records.shape[1]
-    channels = size - PEAK.value - 2
-    warps = warps if channels <= 4 else 4 if channels <= 12 else 8
-    return dict(TINY=torch.finfo(records.dtype).eps ** 0.5, CHANNELS=channels, RECORD=size, num_warps=warps)
+def num_warps(layout: RecordLayout, default: int) -> int:
+    """Warps for each tile: with more channels a thread has fewer pixels, so that all sums stay in registers."""
+    return default if layout.channels <= 4 else 4 if layout.channels <= 12 else 8
 
 
 _MANY_TILES = 32
@@ -249,15 +287,15 @@ _MANY_TILES = 32
 def rasterize_backward_kernel(
     records, record_ids, slots, starts, stops, tile_order, centres, offsets, sums, grad_sums, gradients,
     first_tile, columns, tiles, height, width,
-    TINY: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr,
+    TINY: tl.constexpr, AXES: tl.constexpr, CHANNELS: tl.constexpr, RECORD: tl.constexpr, PEAK: tl.constexpr,
     GRADIENT: tl.constexpr, FIELDS: tl.constexpr,
 ):
     """Write the gradient record of each intersection of a tile; one program for each tile."""
     local = tl.load(tile_order + tl.program_id(0)).to(tl.int64)
     tile = first_tile + local
     pixel = tl.arange(0, _PIXELS)
-    centre = load_numbers(centres + tile * 6, 6)
-    offset = load_rows(offsets + tile * 3 * _PIXELS, _PIXELS, pixel, 3)
+    centre = load_numbers(centres + tile * 2 * AXES, 2 * AXES)
+    offset = load_rows(offsets + tile * AXES * _PIXELS, _PIXELS, pixel, AXES)
     first_channel, stride, inside = locate_pixels(tile, pixel, columns, tiles, height, width, CHANNELS + 2)
     grad = ()
     behind = tl.zeros([_PIXELS], records.dtype.element_ty)  # gradient x (the sums behind the record)
@@ -269,8 +307,8 @@ def rasterize_backward_kernel(
     field = tl.arange(0, FIELDS)
     for at in range(tl.load(starts + local), tl.load(stops + local)):
         record = load_numbers(records + tl.load(record_ids + at).to(tl.int64) * RECORD, RECORD)
-        delta, rows = evaluate_rows(record, centre, offset)
-        falloff, square, ahead, divisor = evaluate_response(rows, record[PEAK - 1], TINY)
+        delta, rows = evaluate_rows(record, centre, offset, AXES)
+        falloff, square, ahead, divisor = evaluate_response(rows, record[PEAK - 1], TINY, AXES)
         raw = record[PEAK] * falloff
         alpha = clamp_alpha(raw)
         weight = alpha * transmittance
@@ -282,12 +320,16 @@ def rasterize_backward_kernel(
         transmittance = transmittance - weight
         grad_peak = tl.where((alpha > 0) & (raw <= _MAX_ALPHA), grad_alpha * falloff, 0.0)
         grad_q = -0.5 * record[PEAK] * grad_peak
-        grad_square = grad_q / divisor  # gradient of q = Q / divisor, for a fixed divisor
-        grad_divisor = -grad_square * (square / divisor)
-        grad_ahead = tl.where(ahead >= TINY, 2 * tl.maximum(ahead, TINY) * grad_divisor, 0.0)
-        grad_square += record[PEAK - 1] * grad_divisor
-        grad_rows = (2 * grad_square * rows[0], 2 * grad_square * rows[1], grad_ahead)
-        numbers = sum_row_gradients(grad_rows, delta) + (tl.sum(grad_divisor * square, axis=0),)
+        if AXES == 3:
+            grad_square = grad_q / divisor  # gradient of q = Q / divisor, for a fixed divisor
+            grad_divisor = -grad_square * (square / divisor)
+            bounded = tl.maximum(ahead, TINY)
+            grad_ahead = tl.where(ahead >= TINY, 2 * bounded * grad_divisor, 0.0)
+            grad_square += record[PEAK - 1] * grad_divisor
+            grad_rows = (2 * grad_square * rows[0], 2 * grad_square * rows[1], grad_ahead)
+            numbers = sum_row_gradients(grad_rows, delta, AXES) + (tl.sum(grad_divisor * square, axis=0),)
+        else:
+            numbers = sum_row_gradients((2 * grad_q * rows[0], 2 * grad_q * rows[1]), delta, AXES)
         numbers = numbers + (tl.sum(grad_peak, axis=0),)
         for c in tl.static_range(CHANNELS + 1):
             numbers = numbers + (tl.sum(weight * grad[c], axis=0),)
@@ -300,13 +342,13 @@ def rasterize_backward_kernel(
 
 @triton.jit
 @no_type_check
-def sum_row_gradients(grad_rows, delta):
+def sum_row_gradients(grad_rows, delta, AXES: tl.constexpr):
     """Sum gradient x (pixel - point) over pixels, row by row, then the gradients alone."""
     sums = ()
-    for f in tl.static_range(3):
-        for k in tl.static_range(3):
+    for f in tl.static_range(AXES):
+        for k in tl.static_range(AXES):
             sums = sums + (tl.sum(grad_rows[f] * delta[k], axis=0),)
-    for f in tl.static_range(3):
+    for f in tl.static_range(AXES):
         sums = sums + (tl.sum(grad_rows[f], axis=0),)
     return sums
 
@@ -344,24 +386,26 @@ def rasterize_backward(
     pixels: TilePixels,
     sums: Float[Tensor, "plane sums height width"],
     grad_sums: Float[Tensor, "plane sums height width"],
+    layout: RecordLayout,
     totals: Float[Tensor, "m gradient"],
 ) -> None:
     """Add the gradients from the tiles of `intersections` to each instance's total.
 
     Args:
-        intersections: intersections of one band of tile rows.
-        stops: stop of each tile, see `rasterize`.
-        pixels: pixels of all planes.
+        intersections: of one band of tile rows.
+        stops: of each tile, see `rasterize`.
+        pixels: of all planes.
         sums: result of forward, all planes.
-        totals: totals of all instances.
+        totals: of all instances.
     """
-    tiles, num = len(intersections.starts) - 1, gradient_size(records)
+    tiles, num = len(intersections.starts) - 1, layout.gradient_size
     fields = triton.next_power_of_2(num)
     gradients = records.new_zeros(len(intersections.record_ids), num)  # 0 where forward stopped early
     rasterize_backward_kernel[(tiles,)](
         records, intersections.record_ids, intersections.slots, intersections.starts, stops,
         sort_tiles_by_load(intersections), pixels.centres, pixels.offsets, sums, grad_sums, gradients,
-        *launch_geometry(intersections, sums), **launch_constants(records, 1), GRADIENT=num, FIELDS=fields,
+        *launch_geometry(intersections, sums), **launch_constants(records, layout), GRADIENT=num, FIELDS=fields,
+        num_warps=num_warps(layout, 1),
     )  # fmt: skip
     counts = intersections.ends.diff(prepend=intersections.ends.new_zeros(1))
     few = torch.nonzero((counts > 0) & (counts <= _MANY_TILES))[:, 0].int()

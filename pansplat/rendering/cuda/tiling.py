@@ -51,9 +51,9 @@ class TileIntersections:
     Attributes:
         rows: first row of tiles, and one past the last.
         record_ids: indices of records, tile after tile.
-        starts: start of each tile in `record_ids`, and the end of the last tile.
+        starts: of each tile in `record_ids`, and the end of the last.
         slots: position of each intersection before the sort by tile; those of an instance are adjacent.
-        ends: end of each instance's slots.
+        ends: of each instance's slots.
     """
 
     rows: tuple[int, int]
@@ -64,25 +64,35 @@ class TileIntersections:
 
 
 def sort_instances(
-    boxes: list[Float[Tensor, "n 4"]], distances: Float[Tensor, "n"], size: tuple[int, int], *, wraps: bool
+    boxes: list[Float[Tensor, "_n 4"]],
+    keys: list[Float[Tensor, "_n"]],
+    bases: list[int],
+    size: tuple[int, int],
+    *,
+    wraps: bool,
 ) -> Instances:
     """Sort the visible records of each image plane front to back.
 
     Args:
-        boxes: boxes on each plane, pixels; left > right where a record is not seen.
-        distances: distance of each record.
+        boxes: on each plane, pixels; left > right where not seen.
+        keys: depths to sort by, on each plane.
+        bases: index of the first record of each plane.
         size: height and width of each plane, pixels.
         wraps: column `width` is column 0.
     """
-    (rows, columns), order = tile_grid(*size, TILE_SIZE), torch.argsort(distances, stable=True)
-    records, ranges = [], []
-    for plane, box in enumerate(boxes):
+    rows, columns = tile_grid(*size, TILE_SIZE)
+    records, ranges, counts = [], [], []
+    order = last = None
+    for plane, (box, key, base) in enumerate(zip(boxes, keys, bases, strict=True)):
+        if order is None or key is not last:  # planes that sort by distance share one order
+            order, last = torch.argsort(key, stable=True), key
         touched = tile_ranges(box, size, wraps, TILE_SIZE).int()
         touched[:, 2] += plane * rows
         seen = order[((touched[:, 1] > 0) & (touched[:, 3] > 0))[order]]
-        records.append(seen.int())
+        records.append((seen + base).int())
         ranges.append(touched[seen])
-    return Instances(torch.cat(records), torch.cat(ranges), list(map(len, records)), (len(boxes) * rows, columns))
+        counts.append(len(seen))
+    return Instances(torch.cat(records), torch.cat(ranges), counts, (len(boxes) * rows, columns))
 
 
 def intersect_tiles(instances: Instances, limit: int = _MAX_INTERSECTIONS) -> Iterator[TileIntersections]:
@@ -154,32 +164,34 @@ class TilePixels:
     """Pixels of all planes by tile, relative to the tile's centre; tiles are row by row.
 
     Attributes:
-        centres: centres of the tiles, rounded to the kernels' type, and the residual of the rounding.
+        centres: of the tiles, rounded to the kernels' type, and the residual of the rounding.
         offsets: pixel minus centre.
     """
 
-    centres: Float[Tensor, "tile both 3"]
-    offsets: Float[Tensor, "tile 3 pixel"]
+    centres: Float[Tensor, "tile both axis"]
+    offsets: Float[Tensor, "tile axis pixel"]
 
 
-def tile_pixels(planes: list[ImagePlane], dtype: torch.dtype) -> TilePixels:
+def tile_pixels(planes: list[ImagePlane], *, exact: bool, dtype: torch.dtype) -> TilePixels:
     """Arrange the pixels of image planes of one size by tile; tiles beyond an edge repeat the last row or column.
 
     Args:
-        dtype: type of the kernels' numbers.
+        exact: points are directions in camera axes, not x, y in pixels.
+        dtype: the kernels' type.
     """
-    tables = [_arrange_pixels(plane, dtype) for plane in planes]
+    tables = [_arrange_pixels(plane, exact, dtype) for plane in planes]
     return TilePixels(*(torch.cat(table) for table in zip(*tables, strict=True)))
 
 
 def _arrange_pixels(
-    plane: ImagePlane, dtype: torch.dtype
-) -> tuple[Float[Tensor, "tile both 3"], Float[Tensor, "tile 3 pixel"]]:
-    points, (rows, columns) = plane.directions(), tile_grid(*plane.size, TILE_SIZE)
+    plane: ImagePlane, exact: bool, dtype: torch.dtype
+) -> tuple[Float[Tensor, "tile both axis"], Float[Tensor, "tile axis pixel"]]:
+    points = plane.directions() if exact else plane.coordinates()
+    rows, columns = tile_grid(*plane.size, TILE_SIZE)
     y = torch.arange(rows * TILE_SIZE, device=points.device).clamp_max(plane.size[0] - 1)
     x = torch.arange(columns * TILE_SIZE, device=points.device).clamp_max(plane.size[1] - 1)
-    points = points[y][:, x].reshape(rows, TILE_SIZE, columns, TILE_SIZE, 3).permute(0, 2, 4, 1, 3)
-    points = points.reshape(rows * columns, 3, TILE_SIZE * TILE_SIZE)
+    points = points[y][:, x].reshape(rows, TILE_SIZE, columns, TILE_SIZE, -1).permute(0, 2, 4, 1, 3)
+    points = points.reshape(rows * columns, -1, TILE_SIZE * TILE_SIZE)
     centres = points.mean(dim=2)
     rounded = centres.to(dtype)
     both = torch.stack((rounded, (centres - rounded.double()).to(dtype)), dim=1)

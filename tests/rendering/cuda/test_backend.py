@@ -82,8 +82,6 @@ def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
 def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     expect_error("on 'cpu'", lambda: rasterize(make_scene(1), pose, size=(4, 8), backend="triton"))
-    options = {"size": (4, 8), "layout": "cubemap", "backend": "triton"}
-    expect_error("kernel 'ray' only", lambda: rasterize(make_scene(1), pose, **options, kernel="ewa"))
 
 
 @pytest.mark.parametrize(
@@ -104,13 +102,12 @@ def test_a_missing_or_old_triton_is_an_error_and_auto_does_not_select_it(
 
 def test_auto_selects_triton_only_on_cuda(unchecked, monkeypatch):
     assert select_automatically(is_cuda=True) is cuda.rasterize_planes
-    assert select_automatically(is_cuda=True, kernel="ewa") is reference.rasterize_planes
     assert select_automatically(is_cuda=False) is not cuda.rasterize_planes
     monkeypatch.setitem(sys.modules, "triton", types.SimpleNamespace(__version__="3.10.0.post1"))
     assert select_automatically(is_cuda=True) is cuda.rasterize_planes
 
 
-def select_automatically(*, is_cuda: bool, kernel: str = "ray") -> object:
+def select_automatically(*, is_cuda: bool) -> object:
     device = torch.device("cuda" if is_cuda else "cpu")
     means = types.SimpleNamespace(is_cuda=is_cuda, device=device, dtype=torch.float32)
-    return _select_backend("auto", types.SimpleNamespace(means=means, harmonics=torch.zeros(1, 1, 3)), kernel)
+    return _select_backend("auto", types.SimpleNamespace(means=means, harmonics=torch.zeros(1, 1, 3)), "ewa")
