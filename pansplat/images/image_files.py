@@ -36,11 +36,12 @@ from pansplat.images.blur_masks import (
     resize_hidden,
     widen_hidden,
 )
-from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage, read_cube
+from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
 from pansplat.images.panorama_metadata import SOFTWARE_XMP, find_stated_problem, find_xmp, make_gpano_xmp
-from pansplat.images.rig_images import RIG_SUFFIX, RigImage, read_rig
+from pansplat.images.rig_images import RIG_SUFFIX, RigImage
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, read_file, require_file
+from pansplat.system.strict_json import read_json
 
 WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff")
@@ -128,7 +129,8 @@ def read_face_size(path: Path | str) -> int:
     """Size of a cube face that has the detail of an image file, pixels: that of the file's faces, else with as many
     pixels for an angle in its middle as the panorama, width / pi. No pixels are decoded."""
     path = Path(path)
-    return read_cube(path).levels[-1].size if path.name.endswith(CUBE_SUFFIX) else int(2 * read_height(path) / math.pi)
+    cube = _read_assembled(path) if is_assembled(path) else None
+    return cube.levels[-1].size if isinstance(cube, CubeImage) else int(2 * read_height(path) / math.pi)
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
@@ -183,7 +185,7 @@ def is_assembled(path: Path) -> bool:
 
 
 def _read_assembled(path: Path) -> CubeImage | RigImage:
-    return read_rig(path) if path.name.endswith(RIG_SUFFIX) else read_cube(path)
+    return read_json(path, RigImage if path.name.endswith(RIG_SUFFIX) else CubeImage)
 
 
 def list_pictures(path: Path) -> list[Path]:
