@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -348,19 +349,11 @@ class Collection:
         if self.ordered or count == 2:
             return list(itertools.pairwise(members))
         centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
-        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)  # Prim's algorithm; in a grid many are equal
-        parent = torch.zeros(count, dtype=torch.long)
-        outside = torch.ones(count, dtype=torch.bool)
-        outside[0] = False
-        edges = []
-        while outside.any():
-            new = int(torch.where(outside, distance, torch.inf).argmin())
-            edges.append(tuple(sorted((members[int(parent[new])], members[new]))))
-            outside[new] = False
-            distance_to_new = (centres - centres[new]).norm(dim=-1).round(decimals=6)
-            parent[distance_to_new < distance] = new
-            distance = torch.minimum(distance, distance_to_new)
-        return sorted(edges)
+        distances = (centres[:, None] - centres).norm(dim=-1).round(decimals=6)
+        # Of equal distances, as in a grid, the first ones are taken on every processor. A weight of 0 is no edge.
+        weights = distances.unique(return_inverse=True)[1] * count**2 + torch.arange(1, count**2 + 1).view(count, count)
+        tree = scipy.sparse.csgraph.minimum_spanning_tree(weights.triu(1).double().numpy())
+        return sorted(tuple(sorted((members[a], members[b]))) for a, b in zip(*tree.nonzero(), strict=True))
 
 
 def localize_sets(pairs: Sequence[PanoramaSet], camera_height: float = CAMERA_HEIGHT) -> list[PanoramaSet]:
