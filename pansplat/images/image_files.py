@@ -158,7 +158,8 @@ def _read_shape(path: Path) -> tuple[int, int, str | None]:
         with open(path, "rb") as file:
             head = file.read(len(_EXR_MAGIC))
         if head.startswith(_EXR_MAGIC):
-            return (*_exr_size(path), None)
+            (left, top), (right, bottom) = np.array(_read_exr(path, header_only=True)).tolist()
+            return right - left + 1, bottom - top + 1, None
         with Image.open(path, formats=_PILLOW_FORMATS) as image:
             size = image.size
             # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
@@ -301,7 +302,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
     _check_height(height)
     data = _read_bytes(path)
     if data.startswith(_EXR_MAGIC):
-        channels = _exr_channels(path)
+        channels = _read_exr(path)
         name = next((n for n in ("Z", "Y") if n in channels), None)
         if name is None:
             raise InputError(f"{path}: needed depth in channel Z or Y, got channels {sorted(channels)}; rename it.")
@@ -611,24 +612,14 @@ def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
     return _DecodedImage(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
 
 
-def _exr_size(path: Path) -> tuple[int, int]:
+def _read_exr(path: Path, *, header_only: bool = False) -> Any:
+    """The channels of an EXR by name, or the corners of its data window."""
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            corners = np.array(file.header()["dataWindow"])
-    except Exception as error:  # OpenEXR has no base class of its errors
-        raise InputError(
-            f"{path}: needed a complete EXR image, got a damaged header ({error}); export it again."
-        ) from error
-    return int(corners[1, 0] - corners[0, 0] + 1), int(corners[1, 1] - corners[0, 1] + 1)
-
-
-def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path)) as file:
+        with OpenEXR.File(str(path), header_only=header_only) as file:
+            if header_only:
+                return file.header()["dataWindow"]
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR has no base class of its errors
         raise InputError(
@@ -637,7 +628,7 @@ def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _decode_exr(path: Path) -> _DecodedImage:
-    channels = _exr_channels(path)
+    channels = _read_exr(path)
     alpha = channels.get("A")
     if "RGBA" in channels:
         linear, alpha = channels["RGBA"][..., :3], channels["RGBA"][..., 3]
