@@ -80,7 +80,7 @@ class Lpips(nn.Module):
 
         Args:
             prediction, target: RGB in [0, 1]; values outside are not clamped.
-            weights: of the pixels; by default equal. The prediction is not used at pixels of weight 0.
+            weights: one for each pixel; by default equal. The prediction is not used at pixels of weight 0.
         """
         if min(target.shape[-2:]) < MIN_IMAGE_SIZE:
             size = "x".join(str(side) for side in target.shape[-2:])

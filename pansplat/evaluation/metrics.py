@@ -111,7 +111,7 @@ def distortion(
     They are from 0 to 1, NaN if nothing counts.
 
     Args:
-        inverse_depth: of the surface, radial; NaN where there is none: pixels beside these do not count.
+        inverse_depth: 1 / radial distance of the surface; NaN where there is none: pixels beside these do not count.
         offset, ahead: place of the moved camera, and direction of the flight, in the view's axes.
     """
     height, width = inverse_depth.shape

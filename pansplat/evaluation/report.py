@@ -63,7 +63,7 @@ def evaluate(
     results.json is written after each pair, so that an interruption keeps the results so far.
 
     Args:
-        refine_steps: of the refinement of each scene; 0 for none.
+        refine_steps: steps of the refinement of each scene; 0 for none.
         blend, drawing: see `pipeline.render`. With "joint", scenes are fused (`fuse_views`), but those of networks are
             not: these are trained for joint drawing.
     """

@@ -95,7 +95,7 @@ class CubeImage:
     """A panorama of cube faces.
 
     Attributes:
-        folder: of the pictures.
+        folder: the folder that holds the pictures.
         levels: complete ones, the smallest first.
     """
 
@@ -135,7 +135,7 @@ def write_description(panorama: Assembled, folder: Path, name: str) -> Path:
 
     Args:
         panorama: all of its paths are whole.
-        folder: of the tour, in whose cache folder the file is written.
+        folder: the tour's; the file is written in its cache folder.
         name: valid as a file name. The file is in a folder of its content: tours of one folder may have equal names.
     """
     content = dataclasses.asdict(panorama) | {BESIDE: folder.resolve()}

@@ -81,7 +81,7 @@ def find_stated_problem(xmp: bytes, width: int, height: int) -> str | None:
     to do; None if they state nothing else, or contradict the picture.
 
     Args:
-        width, height: of the picture, pixels; it may have been resized.
+        width, height: the picture's, pixels; it may have been resized.
     """
     tags = {name: attribute or element for name, attribute, element in _TAG.findall(xmp.decode("utf-8", "replace"))}
     projection = tags.get("ProjectionType", "equirectangular").strip()

@@ -194,10 +194,10 @@ def _read_pose_entry(
     """One entry of poses.json.
 
     Args:
-        folder: of the file.
-        name: of the entry.
+        folder: the folder of poses.json.
+        name: the key of the entry.
         entry: its value.
-        convention: of the pose.
+        convention: that of the pose.
         is_stated: whether `convention` comes from the file.
         view: what a web tour states of the panorama; None for a file.
     """

@@ -63,9 +63,9 @@ class Note:
     """Information at a direction in a panorama, as a tour states it.
 
     Attributes:
-        yaw, pitch: as of a link, radians.
+        yaw, pitch: its direction, as that of a link, radians.
         text: plain text of one or more lines.
-        addresses: of web pages, http or https.
+        addresses: web pages, http or https.
     """
 
     yaw: float
@@ -235,7 +235,7 @@ class Collection:
 
     Attributes:
         source: file or folder that error messages name.
-        folder: of the files.
+        folder: the folder of the files.
         panoramas: in file order; none if no poses are known.
         groups: given context and target views; None to pair neighbours.
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
@@ -389,10 +389,10 @@ def single_view_sets(
     """A pair of one view for each panorama.
 
     Args:
-        folder: of the tour; predictions are cached there.
+        folder: the tour's; predictions are cached there.
         near, far: metres; None for the range of rooms.
         siblings: panoramas of the same camera, by default the same ones.
-        first_world: of the first panorama; each has a world of its own.
+        first_world: the world of the first panorama; each has a world of its own.
     """
     near, far = NEAR if near is None else near, FAR if far is None else far
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')

@@ -174,7 +174,7 @@ def _mark(folder: Path, package: str) -> bool:
 
 # --- worker threads ---
 
-_SLICE_LENGTH = 1 << 15
+_SLICE_LENGTH = 1 << 15  # numbers of a slice: 128 KiB of float32, half of a core's cache
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 _calling_thread = threading.local()
 
@@ -236,7 +236,7 @@ def parallel_for_slices(work: Callable[[slice], object], length: int, report: Ca
 
     Args:
         work: as for `parallel_for`; numpy's loops run without the interpreter lock.
-        length: of the arrays.
+        length: the length of the arrays.
         report: called with the fraction done, by any thread; an exception ends the work.
     """
     count, done = -(-length // _SLICE_LENGTH), itertools.count(1)

@@ -62,7 +62,7 @@ class Store:
     """The entries of a folder: arrays, tensors, JSON, tuples and dataclasses of these.
 
     Args:
-        folder: of the panoramas; None keeps nothing.
+        folder: that of the panoramas; None keeps nothing.
         types: the dataclasses.
     """
 
@@ -229,7 +229,7 @@ def read_entry(path: Path, types: dict[str, type] | None = None) -> Any:
     """The value of an entry; an InputError if it is damaged.
 
     Args:
-        path: of the file.
+        path: the file.
         types: the dataclasses in it, by name.
     """
     content = read_file(path)
