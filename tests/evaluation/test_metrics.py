@@ -114,7 +114,7 @@ def test_the_cross_fade_weights_inputs_by_distance() -> None:
         torch.testing.assert_close(faded, torch.full((3, 8, 16), place), atol=1e-5, rtol=0)
 
 
-ROWS = 256
+ROWS = 128
 SPHERE = torch.full((ROWS, 2 * ROWS), 0.5, dtype=torch.float64)  # inverse depth at 2 m
 RAYS = pixel_directions(ROWS, 2 * ROWS, dtype=torch.float64)
 AHEAD = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
@@ -136,7 +136,7 @@ def test_smooth_surfaces_and_planes_are_not_distorted() -> None:
 
 def test_distortion_grows_with_tears_and_is_zero_without_motion() -> None:
     ahead, aside = zip(*(distortion(tear(jump), HALF, AHEAD) for jump in (0, 0.05, 0.2, 0.6)), strict=True)
-    assert list(ahead) == sorted(ahead) and ahead[-1] > 0.1 and list(aside) == sorted(aside) and aside[1] > 0.1
+    assert list(ahead) == sorted(ahead) and ahead[-1] > 0.1 and list(aside) == sorted(aside) and aside[1] > 0.03
     assert all(wide > narrow for wide, narrow in zip(aside[1:], ahead[1:], strict=True))  # parallax is larger there
     assert max(distortion(tear(0.6), 0 * HALF, AHEAD)) < 1e-3
 

@@ -168,7 +168,7 @@ def test_two_processes_share_a_folder(folder: Path) -> None:
     code = (
         "import sys, pathlib, numpy\nfrom pansplat.system import store\n"
         "store.LIMIT, store._IN_USE_SECONDS = 20_000, -1.0\n"
-        "for n in range(200):\n"
+        "for n in range(60):\n"
         "    store._used.clear()\n"
         "    value = store.Store(pathlib.Path(sys.argv[1])).get('view', str(n % 5), lambda: numpy.full(900, n % 5))\n"
         "    assert (value == n % 5).all()\n"
