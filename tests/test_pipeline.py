@@ -285,6 +285,8 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     count = predict_to_file(masked_pair, tmp_path / "tiles.ply", weights, height=TILED_HEIGHT)
     tiles = load(tmp_path / "tiles.ply")
     assert count == len(tiles.gaussians) == len(scene.gaussians) > 1000
+    assert count == predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
+    assert count == len(load(tmp_path / "tiles.glb").gaussians)
     assert 0 < int((tiles.gaussians.views == 0).sum()) < int((tiles.gaussians.views == 1).sum())  # masked
     np.testing.assert_allclose(_sorted_columns(tiles.gaussians), _sorted_columns(whole.gaussians), atol=1e-5)
     assert not torch.equal(tiles.gaussians.means, whole.gaussians.means)  # ordered by tile
@@ -316,13 +318,6 @@ def test_the_predict_command_streams_large_predictions(
     tiles, whole = (load(tmp_path / name).gaussians for name in ("tiles.ply", "whole.ply"))
     assert tiles.degree == whole.degree == 0
     np.testing.assert_allclose(_sorted_columns(tiles), _sorted_columns(whole), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_tiles_are_written_in_every_format(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
-    count = predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
-    scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
-    assert count == len(scene.gaussians) == len(load(tmp_path / "tiles.glb").gaussians)
 
 
 def test_predictions_are_written_in_the_format_of_the_suffix(
