@@ -18,6 +18,12 @@ from pansplat.errors import InputError
 # Suffixes of scene files; the first that fits a name is its format (pansplat.gaussians.formats).
 SCENE_SUFFIXES = (".compressed.ply", ".spz", ".splat", ".sog", ".glb", ".ply")
 
+PLY_TYPES = {  # numpy's codes of the types in headers of .ply files
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+
 SOFTWARE = "software: pansplat"  # comment in every written file whose format has a place for one
 
 # The forms of SOFTWARE: in pictures, JSON and pages; in scene files; in an entry of a zip; in files of weights.
