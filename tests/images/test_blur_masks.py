@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from panorama_formats import EXAMPLES, write_room
+from panorama_formats import EXAMPLES, write_posed, write_room
 from PIL import Image
 from refusals import expect_error
 
@@ -44,18 +44,15 @@ def _write(path: Path, person: int, mask: np.ndarray | None = HIDDEN) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(_make_photograph(person)).save(path)
     if mask is not None:
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name(f"{path.stem}_blur.png"))
+        _draw_mask(path.with_name(f"{path.stem}_blur.png"), mask)
     return path
 
 
 def _write_pair(folder: Path, person: int) -> Path:
-    poses = {}
-    for number, name in enumerate(("left.png", "right.png")):
-        _write(folder / name, person + number)
-        pose = np.eye(4)
-        pose[0, 3] = 0.5 * number
-        poses[name] = {"cam2world": pose.tolist()}
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    pictures = {f"{name}.png": _make_photograph(person + n) for n, name in enumerate(("left", "right"))}
+    write_posed(folder, pictures, (0, 0.5))
+    for name in ("left", "right"):
+        _draw_mask(folder / f"{name}_blur.png")
     return folder
 
 
@@ -122,7 +119,7 @@ def test_every_read_of_a_photograph_is_blurred(tmp_path: Path, suffix: str) -> N
             Image.fromarray(_make_photograph(person)).save(path, quality=90)
         else:
             write_image(path, _make_photograph(person))
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name("a_blur.png"))
+        _draw_mask(path.with_name("a_blur.png"), mask)
         image, opaque = read_panorama(path, HEIGHT)
         assert opaque.all()
         reads.append((image, read_panorama(path, 32)[0], read_thumbnail(path, 16)))
@@ -143,7 +140,7 @@ def test_cube_faces_of_a_panorama_are_blurred(tmp_path: Path, color_face: Callab
     (pair,) = load_sets(tmp_path)
     plain = pair.load_context(HEIGHT)
     assert pair.context[0].name == "hall" and find_blur_mask(pair.context[0].image) is None
-    Image.fromarray(np.where(HIDDEN, 255, 0).astype(np.uint8)).save(tmp_path / "hall_blur.png")
+    _draw_mask(tmp_path / "hall_blur.png")
     (pair,) = load_sets(tmp_path)
     assert find_blur_mask(pair.context[0].image) == tmp_path / "hall_blur.png"
     views = pair.load_context(HEIGHT)
