@@ -1,5 +1,6 @@
 """Predict into memory or a file, render, save and load."""
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -286,6 +287,8 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     count = predict_to_file(masked_pair, tmp_path / "tiles.ply", weights, height=TILED_HEIGHT)
     tiles = load(tmp_path / "tiles.ply")
     assert count == len(tiles.gaussians) == len(scene.gaussians) > 1000
+    assert count == predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
+    assert count == len(load(tmp_path / "tiles.glb").gaussians)
     assert 0 < int((tiles.gaussians.views == 0).sum()) < int((tiles.gaussians.views == 1).sum())  # masked
     np.testing.assert_allclose(_sorted_columns(tiles.gaussians), _sorted_columns(whole.gaussians), atol=1e-5)
     assert not torch.equal(tiles.gaussians.means, whole.gaussians.means)  # ordered by tile
@@ -317,13 +320,6 @@ def test_the_predict_command_streams_large_predictions(
     tiles, whole = (load(tmp_path / name).gaussians for name in ("tiles.ply", "whole.ply"))
     assert tiles.degree == whole.degree == 0
     np.testing.assert_allclose(_sorted_columns(tiles), _sorted_columns(whole), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_tiles_are_written_in_every_format(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
-    count = predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
-    scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
-    assert count == len(scene.gaussians) == len(load(tmp_path / "tiles.glb").gaussians)
 
 
 def test_predictions_are_written_in_the_format_of_the_suffix(
@@ -423,22 +419,29 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return write
 
 
+@pytest.fixture(scope="module")
+def predict_room(room: Callable[[str], Path]) -> Callable[..., Scene]:
+    """Predict the room of a frame, its places moved in the working world, at 64 rows; each once."""
+
+    @functools.cache
+    def run_prediction(name: str, *moved: float) -> Scene:
+        views = load_sets(room(name))[0].load_context(64)
+        cam2world = views.cam2world.clone()
+        cam2world[:, :3, 3] += torch.tensor(moved or (0.0, 0.0, 0.0), dtype=torch.float64)
+        return predict(replace(views, cam2world=cam2world), "sweep")
+
+    return run_prediction
+
+
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
 def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
-    name: str, room: Callable[[str], Path]
+    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene]
 ) -> None:
     unit, origin = FRAMES[name]
     # An origin of the working world is a multiple of 64 m; that of the poses is not.
-    moved = torch.tensor([0.0, 32.0, 16.0] if origin else [0.0] * 3, dtype=torch.float64)
-    (in_metres,), (pair,) = load_sets(room("metres")), load_sets(room(name))
-    views = in_metres.load_context(64)
-    cam2world = views.cam2world.clone()
-    cam2world[:, :3, 3] += moved
-    views = replace(views, cam2world=cam2world)
-    found = pair.load_context(64)
-    assert torch.equal(found.cam2world, cam2world) and (found.near, found.far) == (views.near, views.far)
-    assert found.frame.unit == unit
-    expected, scene = predict(views, "sweep"), predict(pair, "sweep", height=64, cache=False)
+    expected, scene = predict_room("metres", *((0.0, 32.0, 16.0) if origin else ())), predict_room(name)
+    assert torch.equal(scene.cam2world, expected.cam2world) and scene.frame.unit == unit
+    assert (scene.near, scene.far) == (expected.near, expected.far)
     for field in fields(Gaussians):
         assert torch.equal(getattr(scene.gaussians, field.name), getattr(expected.gaussians, field.name)), field.name
     size = (64, 128)
@@ -449,15 +452,14 @@ def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
 
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
 def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
-    name: str, room: Callable[[str], Path], tmp_path: Path
+    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene], tmp_path: Path
 ) -> None:
-    folder, size, unit = room(name), (64, 128), FRAMES[name][0]
-    scene = predict(folder, "sweep", height=64, cache=False)
+    folder, size, unit, scene = room(name), (64, 128), FRAMES[name][0], predict_room(name)
     ours = render(scene, scene.cam2world[0], size=size).color
     pose = json.loads((folder / "poses.json").read_text())["poses"]["left.jpg"]["cam2world"]
     users = torch.tensor(pose, dtype=torch.float64)
-    suffixes = ("ply", "glb", "compressed.ply", "sog", *(["spz"] if unit == 1 else []))  # .spz ends at 2048
-    for file in (f"scene.{suffix}" for suffix in suffixes):
+    coded = {"millimetres": ("compressed.ply", "sog"), "UTM": ("compressed.ply", "spz"), "UTM in millimetres": ()}
+    for file in (f"scene.{suffix}" for suffix in ("ply", "glb", *coded[name])):
         save(scene, tmp_path / file)
         loaded = load(tmp_path / file)
         torch.testing.assert_close(loaded.frame.globalize(loaded.cam2world)[0], users, rtol=1e-12, atol=1e-7)
@@ -474,11 +476,9 @@ def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
 
 
 def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(
-    room: Callable[[str], Path], tmp_path: Path
+    room: Callable[[str], Path], predict_room: Callable[..., Scene]
 ) -> None:
-    (pair,) = load_sets(room("UTM"))
-    views = pair.load_context(64)
-    scene = predict(views, "sweep")
+    views, scene = load_sets(room("UTM"))[0].load_context(64), predict_room("UTM")
     x, y, z = scene.frame.origin
     frame = replace(scene.frame, origin=(x - 512.0, y, z))
     moved = replace(views, frame=frame, cam2world=frame.localize(scene.frame.globalize(scene.cam2world)))

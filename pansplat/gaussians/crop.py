@@ -21,7 +21,7 @@ def keep_gaussians(scene: Scene, kept: Bool[Tensor, "n"], views: Sequence[int] |
 
     Args:
         scene: a scene.
-        kept: of its Gaussians.
+        kept: True for the Gaussians that stay.
         views: in the order of their new numbers; by default those that have Gaussians. For deferred blending,
             Gaussians of other views are left out. For joint drawing, they belong to the nearest one of these.
     """

@@ -24,7 +24,7 @@ class ApproximatePlace:
 
     Attributes:
         beside: picture of the panorama that it is relative to.
-        right, forward: of that camera, level, in the unit of its pose.
+        right, forward: distances from that camera, level, in the unit of its pose.
         yaw: heading, radians to the right of that camera's.
         by: names of the panoramas whose links state it.
         is_in_heights: whether right and forward are in heights of that camera, as no unit is stated.
@@ -72,7 +72,7 @@ def read_approximate(
 
     Args:
         images: by name.
-        units: of the poses that are known, by name (`read_unit`).
+        units: units of the poses that are known, by name (`read_unit`).
     """
     found = {}
     for _, stated in list_stated_places(estimate):
