@@ -205,13 +205,13 @@ class Render(Computation):
 
 def _plan_route(scene: Scene) -> Route | None:
     """The way through a tour; None for another scene."""
-    from pansplat.tours.graph import make_graph
+    from pansplat.tours.facts import TourFacts
     from pansplat.tours.route import REST_SECONDS, plan_route
 
     if not scene.overlaps:
         return None
-    tour = make_graph(scene)
-    return plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+    facts = TourFacts(scene)
+    return plan_route(facts.tour, facts.tour.plan_walk(), rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
 def read_pose(path: Path) -> Tensor:

@@ -5,15 +5,15 @@ import { nodeHere } from "./camera.js";
 import { byId, canvas, say } from "./dom.js";
 import { camera, currentPart, edges, isComplete, isSortedFor, parts, refresh, state } from "./state.js";
 
-const SILENCE_MS = 10000;                  // of a server, after which a request has failed
-export const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a file that does not arrive, ms between them
-const GZIP = 0x8b1f;                       // its first two bytes
+const SILENCE_MS = 10000; // of a server, after which a request has failed
+export const TRIES = 3, PAUSE_AFTER_ERROR = 2000; // of a file that does not arrive, ms between them
+const GZIP = 0x8b1f; // its first two bytes
 const MISSING = "A part of the scene did not arrive. Load the page again; if that does not help, copy the whole folder.";
 
 export let failure = null;
 let worker = null, chunksArrived = 0;
-let queue = Promise.resolve();             // of files: the first view comes first
-let fails = fail;                          // reports an error of the data
+let queue = Promise.resolve(); // of files: the first view comes first
+let fails = fail; // reports an error of the data
 
 export function fail(error) {
   if (failure) return;
@@ -62,7 +62,7 @@ export async function fetchFile(name, isAgain) {
 function loadView(view, tries = 1) {
   queue = queue.then(async () => {
     const blob = await fetchFile(...HEADER.views[view].files, tries > 1), chunk = await blob.arrayBuffer();
-    if (new Uint16Array(chunk.slice(0, 2))[0] !== GZIP) throw new Error("this is no gzip");  // but a page of the server
+    if (new Uint16Array(chunk.slice(0, 2))[0] !== GZIP) throw new Error("this is no gzip"); // but a page of the server
     state.missing.delete(view);
     receive(view, true, chunk);
   }).catch(() => {

@@ -10,7 +10,10 @@ export const GRAPH = {
   clearances: HEADER.spots.map((spot) => spot.clearances),
 };
 
-export const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
+export function makeStart() {
+  const { position, ahead: [yaw, pitch] } = HEADER.spots[HEADER.walk[0]];
+  return { position: [...position], yaw, pitch, roll: 0, fov: HEADER.startFov };
+}
 export const camera = makeStart();
 
 // How far each view has faded in. The first ones are there at once.

@@ -7,7 +7,7 @@
 import { blendWeights, findSpot, floorPoint, walk } from "./camera.js";
 import { byId, calm, explain } from "./dom.js";
 import { coverage, goHome, goTo, isFlying, jumpTo, setTouring } from "./flight.js";
-import { clamp, column, cross, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
+import { clamp, column, cross, distanceOf, dot, fromAxes, minus, multiply, plus, scaled, unit } from "./graph.js";
 import { requestSort } from "./loading.js";
 import { advance, SORT_DISTANCE } from "./loop.js";
 import { photographs } from "./photographs.js";
@@ -29,7 +29,6 @@ const BUTTONS = { 4: () => goHome(), 5: () => headset.leave() }; // A and X, B a
 
 const rowsOf = (matrix) => [0, 1, 2].map((row) => [0, 1, 2].map((k) => matrix[4 * k + row]));
 const pointOf = ({ x, y, z }) => [x, y, z];
-const unit = (vector) => scaled(vector, 1 / Math.max(Math.hypot(...vector), 1e-9));
 
 class Headset {
   gl = null;
@@ -164,7 +163,7 @@ class Headset {
   }
 
   rotate(vector) {
-    return this.toScene.map((row) => dot(row, vector));
+    return fromAxes(this.toScene, vector);
   }
 
   pointInScene(point) {

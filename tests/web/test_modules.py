@@ -108,19 +108,19 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
     """What the modules read of a header of level panoramas; each edge blends its two views."""
     spots = [
         {"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": "", "clearances": []}
+        | {"ahead": [0.0, 0.0], "turns": [0.0] * 24}
         for place in positions
     ]
     house = make_house([node for node, part in enumerate(parts) if part == 0])
     return msgspec.to_builtins(PageConstants()) | {
         "spots": spots,
-        "views": [{"position": place, "count": 1, "start": view} for view, place in enumerate(positions)],
+        "views": [{"count": 1, "start": view} for view in range(len(positions))],
         "level": np.eye(3).tolist(),
-        "start": {"position": positions[0], "yaw": 0.0, "pitch": 0.0, "fov": 75.0},
+        "walk": [*range(len(positions))],
         "edges": [(*edge, group) for group, edge in enumerate(edges)],
         "groups": [sorted({*edge}) for edge in edges] or [list(range(len(positions)))],
         "parts": parts,
         "limits": [2.0] * (max(parts) + 1),
-        "hysteresis": 0.25,
         "poor": [],
         "next": [],
         "doll": [house | {"moves": [(0.0, *positions[node]) for node in house["nodes"]]}],
@@ -216,6 +216,8 @@ def test_the_rings_of_a_panorama_are_its_own_links_and_its_flights(node: str, tm
     assert choose_rings(node, tmp_path, links=[door]) == [(1, None), (2, None), (0, None)], "not those of the next one"
     assert choose_rings(node, tmp_path, links=[door], here=1)[0] == (3, 1)
     assert choose_rings(node, tmp_path, links=[{"from": 0, "to": 3}]) == [(1, None), (2, None), (0, None)], "no place"
+    assert choose_rings(node, tmp_path, links=[door], here=3) == [(1, None), (3, None)], "what leads here"
+    assert choose_rings(node, tmp_path, here=3) == [(2, None), (3, None)], "the nearest one, where nothing leads"
 
 
 def test_surfaces_hide_rings_but_those_of_the_photographs_own_links(node: str, tmp_path: Path) -> None:
@@ -247,6 +249,12 @@ def test_a_way_ends_in_the_start_view_or_straight_on_and_away_from_the_link_back
         node, tmp_path, header, program, [[1, way], [0, way], [0, None], [3, way, 2], [1, way, 2], [2, None, 3]]
     )
     assert found == [[0.4, 0.3], [2, 0], [0.4, 0.3], [1 + math.pi, 0], [0.4, 0.3], [0.4, 0.3]]
+    for spot in header["spots"]:
+        spot["turns"] = [0.1 * number for number in range(24)]
+    found = run(node, tmp_path, header, program, [[1, way], [0, way], [3, way, 2]])
+    bins = [math.floor((angle / (2 * math.pi) + 0.5) * 24) for angle in (2.0, 1 - math.pi)]
+    expected = [0.4, 2 + 0.1 * bins[0], 1 + math.pi + 0.1 * bins[1]]
+    assert [yaw for yaw, _ in found] == pytest.approx(expected), "from a wall that is close, but for a start view"
 
 
 def test_a_camera_stays_at_photographs_without_gaussians(node: str, tmp_path: Path) -> None:
