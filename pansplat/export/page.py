@@ -77,7 +77,7 @@ _PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
-_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "size": (1.0, 1.0), "places": ()}
+_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
@@ -422,10 +422,11 @@ def _describe_scene(
 def _describe_plan(facts: TourFacts) -> dict[str, Any]:
     """The floor plan: its drawing, and where the panoramas are on it."""
     svg, size, places = draw_page_plan(facts.plan)
-    rooms = [room.panoramas for room in facts.plan.rooms]
+    rooms = facts.plan.rooms
     return {
         "worlds": facts.tour.worlds,
-        "rooms": rooms,
+        "rooms": [room.panoramas for room in rooms],
+        "isSure": all(room.is_placed for room in rooms),
         "drawing": base64.b64encode(svg).decode(),
         "size": size,
         "places": places,

@@ -106,6 +106,7 @@ class PagePlan(_Record):
         worlds: of each panorama.
         rooms: the panoramas of each room.
         drawing: an SVG, base64.
+        is_sure: whether the places of all rooms are known; else some are dashed.
         size: its width and height, metres.
         places: of each panorama, to the right and down from the upper left corner, metres; and what yaws there are
             turned by, radians to the right, None if that is unknown.
@@ -114,6 +115,7 @@ class PagePlan(_Record):
     worlds: tuple[int, ...]
     rooms: tuple[tuple[int, ...], ...]
     drawing: str
+    is_sure: bool
     size: tuple[float, float]
     places: tuple[tuple[float, float, float | None], ...]
 

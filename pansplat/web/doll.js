@@ -2,7 +2,7 @@
 // describes it.
 
 import { rotationOf, tangentOf, turned } from "./camera.js";
-import { clamp, column, cross, DEGREE, distanceOf, dot, fromAxes, inAxes, indexOfLeast, minus, plus, scaled } from "./graph.js";
+import { clamp, cross, DEGREE, distanceOf, dot, fromAxes, inAxes, indexOfLeast, minus, plus, scaled } from "./graph.js";
 import { camera, changed, GRAPH, state } from "./state.js";
 
 const DOLL_FOV = 45; // degrees, vertical, of a landscape picture
@@ -36,27 +36,31 @@ export function frameDoll(size) {
   return { position: placeOutside(yaws[best], DOLL_PITCH), yaw: yaws[best], pitch: DOLL_PITCH, fov: DOLL_FOV };
 }
 
-// The share of the picture that the floor plan covers at its left, and half of the width of the picture at a distance of 1.
+// To the right and down: the share of the picture that the floor plan covers, at its left or in a portrait picture at its top, and
+// half of the size of the picture at a distance of 1.
 function frame([width, height]) {
-  return [Math.min(state.doll.covered / width, 0.5), tangentOf(width, height, DOLL_FOV) * width / height];
+  const tall = tangentOf(width, height, DOLL_FOV), [right, bottom] = state.doll.covered, isPortrait = height > width;
+  return [[isPortrait ? 0 : Math.min(right / width, 0.5), tall * width / height], [isPortrait ? Math.min(bottom / height, 0.5) : 0, tall]];
 }
 
 // The distance from which places around the middle are in the picture, beside the floor plan.
 function fit(offsets, yaw, pitch, size) {
-  const rotation = turned(yaw, pitch), [covered, wide] = frame(size), tall = wide * size[1] / size[0];
+  const rotation = turned(yaw, pitch), sides = frame(size);
   const needed = offsets.map((offset) => {
     const [x, y, z] = inAxes(rotation, offset);
-    return Math.max((x / wide - z) / (1 - covered), ((2 * covered - 1) * z - x / wide) / (1 - covered), Math.abs(y) / tall - z);
+    return Math.max(...sides.map(([covered, half], k) => {
+      const along = [x, y][k] / half;
+      return Math.max(along - z, (2 * covered - 1) * z - along) / (1 - covered);
+    }));
   });
   return 1.05 * needed.reduce((most, each) => Math.max(most, each));
 }
 
 // Where a camera with these angles sees all rooms, unless a visitor has come nearer.
 function placeOutside(yaw, pitch) {
-  const { center, offsets, size, first, zoom } = state.doll, [covered, wide] = frame(size);
-  const rotation = rotationOf({ yaw, pitch, roll: 0 }), [right, forward] = [0, 2].map((k) => column(rotation, k));
+  const { center, offsets, size, first, zoom } = state.doll, aside = frame(size).map(([covered, half]) => covered * half);
   const distance = zoom * Math.max(first, fit(offsets, yaw, pitch, size));
-  return minus(center, scaled(plus(forward, scaled(right, covered * wide)), distance));
+  return minus(center, scaled(fromAxes(rotationOf({ yaw, pitch, roll: 0 }), [...aside, 1]), distance));
 }
 
 export function orbit(yaw, pitch) {

@@ -17,16 +17,19 @@ class Plan {
   toggle() {
     this.panel.hidden = this.isOpen;
     byId("map").setAttribute("aria-pressed", this.isOpen);
-    state.doll.covered = this.isOpen ? this.panel.getBoundingClientRect().right : 0;
+    if (this.isOpen && this.buttons === null) this.make();
+    const { right, bottom } = this.panel.getBoundingClientRect(); // 0 while it is hidden
+    state.doll.covered = [right, bottom];
     if (state.doll.isOn) resizeDoll(state.doll.size);
     changed();
   }
 
   make() {
-    const { drawing, size, places } = HEADER.plan, picture = make("img", ""), [wide, tall] = size;
+    const { drawing, size, places, isSure } = HEADER.plan, picture = make("img", ""), [wide, tall] = size;
     picture.src = `data:image/svg+xml;base64,${drawing}`;
     picture.alt = "";
     this.camera = byId("here");
+    byId("legend").hidden = isSure;
     byId("drawing").style.aspectRatio = wide / tall;
     this.buttons = places.map(([x, y], node) => {
       const button = make("button", "");
@@ -46,7 +49,6 @@ class Plan {
 
   show() {
     if (!this.isOpen) return;
-    if (this.buttons === null) this.make();
     const { size, places } = HEADER.plan, [x, y, turn] = places[state.here], [c, s] = [Math.cos(turn), Math.sin(turn)];
     const [right, , forward] = inAxes(HEADER.level, minus(camera.position, GRAPH.positions[state.here]));
     const left = (x + c * right + s * forward) / size[0], top = (y + s * right - c * forward) / size[1];

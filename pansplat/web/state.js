@@ -40,7 +40,7 @@ export const state = {
   flight: null,
   isTouring: false,
   still: null,
-  doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: 0 },
+  doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: [0, 0] },
   headset: { session: null, turnTo(_yaw) {} }, // xr.js
   here: null, // the panorama at the camera of the last frame
   step: [0, 0, 0], // right, up and forward, by the keys that are held

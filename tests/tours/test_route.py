@@ -169,7 +169,7 @@ def test_a_zoom_without_a_link_grows_where_the_camera_looks_and_arrives_in_the_s
 
 def test_a_way_ends_beside_a_wall_that_is_close_unless_a_start_view_is_stated(comb, home):
     closed = np.full(24, 4.0)
-    closed[10:14] = 0.5  # ahead
+    closed[8:16] = 0.5  # ahead
     walls = dict.fromkeys(range(7), closed)
     for tour, walk in ((comb, [0, 1]), (home, [2, 3])):  # a flight, a zoom away from the link back
         start = _start(tour, walk[0])

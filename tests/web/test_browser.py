@@ -1705,6 +1705,10 @@ def test_the_floor_plan_is_a_drawing_with_the_camera_and_leads_to_panoramas(chro
         page.wait(f"Math.abs(parseFloat({here}.rotate) - 90) < 1e-3")
         place = np.array([float(page.run(f"parseFloat({here}.{side})")) for side in ("left", "top")]) / 100
         assert corner + place * (drawing["width"], drawing["height"]) == pytest.approx(centers[0], abs=0.6)
+        mark = page.page.query_selector("#here").bounding_box()  # turned by 90 degrees, around its place
+        assert (mark["width"], mark["height"]) == pytest.approx((44, 18))
+        assert (mark["x"] + 22, mark["y"] + 9) == pytest.approx(centers[0], abs=0.6)
+        assert page.page.inner_text("#legend") == "Dashed: place not sure"
         position = np.array(page.run("HEADER.spots[0].position")) + 0.5 * np.array(page.run("HEADER.level"))[:, 0]
         page.run("(position) => pansplat.setPose({ position })", position.tolist())
         page.settle()

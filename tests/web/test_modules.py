@@ -217,7 +217,7 @@ def test_the_rings_of_a_panorama_are_its_own_links_and_its_flights(node: str, tm
     assert choose_rings(node, tmp_path, links=[door], here=1)[0] == (3, 1)
     assert choose_rings(node, tmp_path, links=[{"from": 0, "to": 3}]) == [(1, None), (2, None), (0, None)], "no place"
     assert choose_rings(node, tmp_path, links=[door], here=3) == [(1, None), (3, None)], "what leads here"
-    assert choose_rings(node, tmp_path, here=3) == [(2, None), (3, None)], "the nearest one, where nothing leads"
+    assert choose_rings(node, tmp_path, here=3) == [(0, None), (3, None)], "the nearest one, where nothing leads"
 
 
 def test_surfaces_hide_rings_but_those_of_the_photographs_own_links(node: str, tmp_path: Path) -> None:
@@ -382,7 +382,7 @@ def test_the_dolls_house_is_in_the_picture_and_a_zoom_has_limits(node: str, tmp_
     program = """(size) => {
         Object.assign(camera, frameDoll(size));
         const seen = findHouse().corners.map((place) => {
-            const [x, y, z] = [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), minus(place, camera.position)));
+            const [x, y, z] = inAxes(rotationOf(camera), minus(place, camera.position));
             const tangent = tangentOf(...size);
             return [Math.abs(x) / z / tangent * size[1] / size[0], Math.abs(y) / z / tangent, z];
         });
@@ -408,7 +408,7 @@ def test_the_dolls_house_stays_in_the_picture_when_it_is_turned(node: str, tmp_p
             orbit(Math.PI / 12, step < 12 ? 0.05 : -0.05);
             distances.push(distanceOf(camera.position, state.doll.center));
             const places = findHouse().corners.map((place) => minus(place, camera.position));
-            const local = places.map((place) => [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), place)));
+            const local = places.map((place) => inAxes(rotationOf(camera), place));
             const [wide, tall] = [0, 1].map((k) => Math.max(...local.map((place) => Math.abs(place[k] / place[2]))));
             widths.push(Math.max(wide * size[1] / size[0], tall) / tangent);
         }
@@ -419,17 +419,18 @@ def test_the_dolls_house_stays_in_the_picture_when_it_is_turned(node: str, tmp_p
     assert max(widths) <= 1 and min(distances) == pytest.approx(first) and max(distances) > 1.3 * first
 
 
-def test_the_dolls_house_is_beside_an_open_floor_plan(node: str, tmp_path: Path) -> None:
+def test_the_dolls_house_is_beside_an_open_floor_plan_and_below_it_on_a_phone(node: str, tmp_path: Path) -> None:
     program = """(size, covered) => {
         state.doll.covered = covered;
         Object.assign(camera, frameDoll(size));
-        const local = findHouse().corners.map((place) => minus(place, camera.position)).map((place) =>
-            [0, 1, 2].map((k) => dot(column(rotationOf(camera), k), place)));
-        return local.map(([x, , z]) => 0.5 * size[0] + 0.5 * size[1] * x / z / tangentOf(...size, camera.fov));
+        const local = findHouse().corners.map((place) => inAxes(rotationOf(camera), minus(place, camera.position)));
+        const scale = 0.5 * size[1] / tangentOf(...size, camera.fov);
+        return local.map(([x, y, z]) => [0.5 * size[0] + scale * x / z, 0.5 * size[1] + scale * y / z]);
     }"""
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
-    covered, free = (run(node, tmp_path, header, program, (320, 720), width) for width in (80, 0))
-    assert min(covered) >= 80 and max(covered) <= 320 and min(free) < 80
+    for size, axis in (((720, 640), 0), ((320, 640), 1)):
+        covered, free = (np.array(run(node, tmp_path, header, program, size, [bar, bar]))[:, axis] for bar in (300, 0))
+        assert min(covered) >= 300 and max(covered) <= size[axis] and min(free) < 300
 
 
 def test_a_ray_meets_the_nearest_front_of_the_dolls_house(node: str, tmp_path: Path) -> None:
