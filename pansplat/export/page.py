@@ -65,17 +65,17 @@ from pansplat.tours.links import find_link_ring, link_parts
 from pansplat.tours.outlook import find_turns, find_widest
 from pansplat.tours.route import find_angles, find_start_angles
 
-DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
-PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
+DEFAULT_GAUSSIANS = 600_000  # make a page of about 13 MB
+PHOTO_GAUSSIANS = 450_000  # make one of about 10 MB, to which photographs are added
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
-MAX_FILE_BYTES = 64_000_000  # of a page in one file
-_TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
-_GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
-_SEEN_SHARE = 2 / 3  # of the Gaussians of a panorama, beside photographs that need the bytes
-_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # of a page: a Gaussian, and a photograph as a fraction of its squared rows
-_PROGRAM_BYTES = 200_000  # of a page without its data
-_PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
-_FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
+MAX_FILE_BYTES = 64_000_000  # largest page in one file
+_TARGET_BYTES = 15_000_000  # in larger pages harmonics of higher degree are left out, and photographs are smaller
+_GAUSSIANS_SHARE = 1 / 2  # part of the target for Gaussians, where there are photographs
+_SEEN_SHARE = 2 / 3  # part of the Gaussians that is kept where photographs need the bytes
+_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # size in a page: of a Gaussian, and of a photograph as a factor of its rows^2
+_PROGRAM_BYTES = 200_000  # size of a page without its data
+_PART_BYTES = 1_500_000  # size of the data between two steps of the progress bar; divisible by 3
+_FIT_STEPS = 8  # steps of the fit of merged Gaussians to the images of all
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
 _NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
@@ -84,7 +84,7 @@ _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "
 _SHADERS |= {"photograph": ("screen.vert", "photograph.frag"), "house": ("house.vert", "house.frag")}
 
 _WORKER = ("unpack.js", "sorter.js")
-_LIBRARIES = ("graph.js", "renderer.js")  # which know nothing of the page; scripts of their own
+_LIBRARIES = ("graph.js", "renderer.js")  # scripts of their own, which know nothing of the page
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./(\w+\.js)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
@@ -137,7 +137,8 @@ def write_page(
         address: of the page on the web, for previews of links to it. They show the poster of a split page.
         photographs: of each view, which the page shows there (`list_photographs`), with the notes of its
             tour; none without them.
-        photo_height: their largest height, pixels, 0 for none; by default what fits, if it is split that of the files.
+        photo_height: largest height of photographs, pixels, 0 for none; by default what fits, in a split page that
+            of the files.
     """
     path = Path(path)
     if not 1 <= gaussians <= MAX_GAUSSIANS:

@@ -28,14 +28,14 @@ from pansplat.tours.graph import CLEARANCE, EDGE_HYSTERESIS, POOR_REACH
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import RING_DISTANCE, RING_RADIUS
 
-MAX_DEGREE = 3  # of the harmonics of a page
+MAX_DEGREE = 3  # highest degree of the harmonics of a page
 BATCH = 256  # quads that are drawn together
-_CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
-_MORTON_BITS = 10  # of each coordinate
+_CONSTANT_BYTES = 23  # size of a Gaussian without harmonics of degree 1 and above
+_MORTON_BITS = 10  # bits of each coordinate in the order of a Z-curve
 _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
 
 
-Vector: TypeAlias = tuple[float, float, float]  # in the scene's world, relative to the page's origin
+Vector: TypeAlias = tuple[float, float, float]  # axes of the scene's world, relative to the page's origin
 
 
 class _Record(msgspec.Struct, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=True):
@@ -139,7 +139,7 @@ class PageConstants(_Record, kw_only=True):
     near: float = constants.NEAR
     filter_variance: float = constants.FILTER_VARIANCE
     tallest: float = 1.5  # height of a portrait image relative to a landscape one
-    start_fov: float = 75.0  # of a landscape image at the start, vertical
+    start_fov: float = 75.0  # vertical field of view of a landscape image at the start, degrees
     min_fov: float = constants.MIN_FOV_DEGREES
     max_fov: float = constants.MAX_FOV_DEGREES
     max_pitch: float = math.radians(constants.MAX_PITCH_DEGREES)

@@ -20,11 +20,11 @@ from pansplat.tours.surfaces import Outline, meet_outline, ray_directions
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
 _ASIDE, _LINK_ERROR = range(-180, 180, 6), 12.0  # degrees: of a door from its link, and the usual one
-_THICKNESS, _STEP = 0.08, 0.45  # of a wall between two rooms; from a wall to the dot of a room behind it
+_THICKNESS, _STEP = 0.08, 0.45  # thickness of a wall between two rooms; from a wall to the dot of a room behind it
 _MOST_OVERLAP, _PUSH = 0.01, 0.1  # share of a room in others; step away from them
 _APART, _FARTHEST = 9.0, 200.0  # cost of a unit away, and at most
-_PLACE_ERROR, _TURN_ERROR = 0.5, 0.25  # of a stated place, and its turn, radians
-_FAN = math.radians(50)  # between dots that are behind one dot
+_PLACE_ERROR, _TURN_ERROR = 0.5, 0.25  # errors of a stated place, and of its turn, radians
+_FAN = math.radians(50)  # angle between dots that are behind one dot
 
 
 Vector, Way = Float[np.ndarray, "2"], tuple[int, int]

@@ -9,14 +9,17 @@ from jaxtyping import Float, Int
 
 from pansplat.tours.surfaces import Surfaces
 
-BINS = 24  # of the horizon; the first one begins at the yaw -pi
-_ROWS = 12  # of clearances, from above to below
+BINS = 24  # directions of the horizon; the first one begins at the yaw -pi
+_ROWS = 12  # rows of clearances, from above to below
 _NEAREST = 0.1  # quantile of the distances of surfaces in one direction
-_ELEVATION = math.sin(math.radians(20))  # of the surfaces that count, above and below the horizon
+_ELEVATION = math.sin(math.radians(20))  # sine of the largest angle above or below the horizon of surfaces that count
 _WINDOW = 3  # bins of a view, 45 degrees
 _CLOSE, _OPEN = 1.0, 1.5  # metres: mean distance of a view into a wall; of one with room in front
 _CONE = math.cos(math.radians(2))  # around the direction of a mark
-_IN_FRONT, _HIDING = 0.8, 0.5  # of its distance, and the share of the surfaces there that hide it
+_IN_FRONT, _HIDING = (
+    0.8,
+    0.5,
+)  # a mark is hidden by surfaces within this factor of its distance, if their share is larger
 
 
 def measure_outlook(surfaces: Surfaces) -> Float[np.ndarray, "bin"]:

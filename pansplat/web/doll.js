@@ -6,7 +6,7 @@ import { clamp, cross, DEGREE, distanceOf, dot, fromAxes, inAxes, indexOfLeast, 
 import { camera, changed, GRAPH, state } from "./state.js";
 
 const DOLL_FOV = 45; // degrees, vertical, of a landscape picture
-const DOLL_PITCH = -45 * DEGREE; // of the first view
+const DOLL_PITCH = -45 * DEGREE; // pitch of the first view
 const LOWEST = -8 * DEGREE; // pitch of a camera that looks along the floor
 const DOLL_ZOOM = [0.15, 2]; // nearest and farthest, as factors of the distance from which all rooms are in the picture
 const DOLL_TURN = Math.PI / 2; // radians a second, by keys
@@ -71,7 +71,7 @@ export function orbit(yaw, pitch) {
   changed();
 }
 
-// For a window of another size; during a flight its end follows.
+// Frames the house for a window of another size; during a flight its end follows.
 export function resizeDoll(size) {
   const { doll } = state;
   Object.assign(doll, { size, first: fit(doll.offsets, camera.yaw, DOLL_PITCH, size) });
@@ -102,7 +102,7 @@ export function meetHouse(origin, ray, { corners } = findHouse()) {
   let nearest = null;
   for (let first = 0; first < corners.length; first += 3) {
     const [a, b, c] = corners.slice(first, first + 3), normal = cross(minus(b, a), minus(c, a)), toward = dot(normal, ray);
-    if (toward <= 0 || Math.max(a[3], a[4]) > 1) continue; // from behind, and the tops of walls
+    if (toward <= 0 || Math.max(a[3], a[4]) > 1) continue; // backs, and the tops of walls
     const distance = dot(normal, minus(a, origin)) / toward, place = plus(origin, scaled(ray, distance));
     const isInside = [[a, b], [b, c], [c, a]].every(([from, to]) => dot(cross(minus(to, from), minus(place, from)), normal) >= 0);
     if (isInside && distance > 0 && (nearest === null || distance < nearest)) nearest = distance;

@@ -35,9 +35,9 @@ export function make(tag, className, ...children) {
   return element;
 }
 
-const MAX_PIXELS = 3e6; // of the canvas: limits the memory of its render targets
+const MAX_PIXELS = 3e6; // largest number of pixels of the canvas, which limits the memory of its render targets
 
-// Of the canvas at the full resolution.
+// The size of the canvas at the full resolution, pixels.
 export function fullSize() {
   const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
   const full = Math.min(ratio, Math.sqrt(MAX_PIXELS / (clientWidth * clientHeight || 1)));

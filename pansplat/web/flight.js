@@ -10,10 +10,10 @@ import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
 import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, state } from "./state.js";
 
-const DOLL_SECONDS = 1.6; // of a flight out of the rooms, or into one
+const DOLL_SECONDS = 1.6; // duration of a flight out of the rooms, or into one
 const MAX_STILL = 8e6; // pixels of the image of a still, whose memory it limits
 const NEAR = HEADER.speed; // metres: a second's walk
-export const PHOTO_WAIT_MS = 2000; // for a photograph, at most: where a zoom ends, and of the first Gaussians
+export const PHOTO_WAIT_MS = 2000; // longest wait for a photograph: at the end of a zoom, and before the first Gaussians are loaded
 
 export function jump(position, { yaw, pitch }, isZoom = false) {
   takeStill(isZoom);
@@ -87,7 +87,7 @@ export function enterAt(left, top) {
   visit(nearestInDoll(plus(camera.position, scaled(rayOf(left, top), distance))));
 }
 
-// Without a flight. `isDue`: it opens when its data is there.
+// Opens or closes the doll's house without a flight. `isDue`: it opens when its data is there.
 function setDoll(isOn, isDue = false) {
   const { doll } = state;
   if (doll.isOn && !isOn) camera.fov = doll.fov;
@@ -230,7 +230,7 @@ export const isFlying = () => state.flight !== null;
 // The still, the image of the last camera before a jump, covers the new one until that is sorted, then it fades out.
 const stillCanvas = byId("still");
 
-// That of a zoom is large enough to grow.
+// Takes the still from the picture; for a zoom it is large enough to grow.
 function takeStill(isZoom = false) {
   if (!state.renderer || !state.sorted) return;
   const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * HEADER.zoom * camera.fov * DEGREE) : 1;

@@ -5,15 +5,15 @@ import { nodeHere } from "./camera.js";
 import { byId, canvas, say } from "./dom.js";
 import { camera, currentPart, edges, isComplete, isSortedFor, parts, refresh, state } from "./state.js";
 
-const SILENCE_MS = 10000; // of a server, after which a request has failed
-export const TRIES = 3, PAUSE_AFTER_ERROR = 2000; // of a file that does not arrive, ms between them
-const GZIP = 0x8b1f; // its first two bytes
+const SILENCE_MS = 10000; // silence of a server after which a request has failed
+export const TRIES = 3, PAUSE_AFTER_ERROR = 2000; // tries of a file that does not arrive, and milliseconds between two
+const GZIP = 0x8b1f; // the first two bytes of a gzip
 const MISSING = "A part of the scene did not arrive. Load the page again; if that does not help, copy the whole folder.";
 
 export let failure = null;
 let worker = null, chunksArrived = 0;
-let queue = Promise.resolve(); // of files: the first view comes first
-let fails = fail; // reports an error of the data
+let queue = Promise.resolve(); // loads one file after the other; the first view comes first
+let fails = fail; // the function that reports an error of the data
 
 export function fail(error) {
   if (failure) return;

@@ -11,7 +11,7 @@ const DENSITY = 1.3; // texels of a pixel in the middle of a face, at least
 const KEPT = 3; // photographs whose textures are kept
 const AT_ONCE = 6; // tiles that are read at the same time
 const SMALL_FACE = 2048; // largest face on a phone, texels
-// Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
+// Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number in OpenGL.
 const FACES = [
   [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4],
   [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0],
@@ -20,7 +20,7 @@ const FACES = [
   [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2],
   [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
-const texts = new Map(); // of a page in one file: base64 of the tiles that have arrived
+const texts = new Map(); // base64 of the tiles that have arrived in a page of one file
 
 // In a page of one file there is a script for the smallest tiles of a photograph and one for the others; they are in the
 // element before.

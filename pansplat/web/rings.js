@@ -9,8 +9,8 @@ import { clamp, column, distanceOf, dot, inAxes, minus, wrapAngle } from "./grap
 import { camera, state } from "./state.js";
 
 const ARROW = 44, BORDER = 8; // pixels: size of an arrow, and to the border
-const MAX_ARROWS = 3; // at a side of the picture
-let rings = [], chosenFor = null, chosen = []; // for a panorama
+const MAX_ARROWS = 3; // largest number of arrows at a side of the picture
+let rings = [], chosenFor = null, chosen = []; // all rings; the nearest panorama, and its rings
 
 export function makeRings() {
   const links = HEADER.links.filter((link) => link.mark);
@@ -43,7 +43,7 @@ function update() {
   }
 }
 
-// Those of the nearest panorama, without that at the camera; of the doll's house all in it.
+// The rings of the nearest panorama, without that at the camera; in the doll's house those of all panoramas in it.
 export function findRings() {
   update();
   if (state.doll.isOn) return rings.filter(({ link, node }) => !link && isInDoll(node));
@@ -103,7 +103,7 @@ function findBorder(offset, focal, sides, taken) {
   const at = [0.5 * width + x - half, 0.5 * height + y - half];
   const inward = { left: [1, 0], right: [-1, 0], up: [0, 1], down: [0, -1] }[side], steps = [...Array(40).keys()].map((k) => (k % 2 ? 1 : -1) * half * Math.ceil(k / 2));
   const boxes = [0, 1, 2].flatMap((row) =>
-    steps.map((step) => { // beside the place, else above what is there
+    steps.map((step) => { // beside the place, else in a row above it
       const [left, top] = at.map((value, k) => clamp(value + (inward[k] ? 0 : step), BORDER, most[k]) + row * (ARROW + BORDER) * inward[k]);
       return [left, top, left + ARROW, top + ARROW];
     })

@@ -20,7 +20,7 @@ export const camera = makeStart();
 export const shown = HEADER.views.map(() => 0);
 
 export const state = {
-  // At the camera; `fade`: from the views of another group.
+  // The edge at the camera, and the group that is blended there; `fade` is from the views of another group.
   edge: 0,
   group: edges.length ? edges[0][2] : 0,
   fade: null,
@@ -32,7 +32,7 @@ export const state = {
   sorted: null,
   isSorting: false,
   renderer: null, // null while the graphics are lost
-  // Of the picture: whether it is old, its scale, and when it changed last.
+  // Whether the picture is old, its scale, and when it changed last.
   isDirty: true,
   drawnScale: 0,
   lastChange: 0,
