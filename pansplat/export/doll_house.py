@@ -374,9 +374,14 @@ class _Painter:
         world = torch.from_numpy(places.reshape(-1, 3)) @ self.level.T
         is_shown = are_seen(world, self.poses[view], self.reaches[view]).numpy().reshape(distance.shape)
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
-        is_below = (np.hypot(offsets[..., 0], offsets[..., 2]) < _TRIPOD * unit) & (offsets[..., 1] > 0.5 * unit)
+        house = list(self.rooms.houses[panel.house])
+        aside = np.linalg.norm((places[..., None, :] - self.eyes[house])[..., (0, 2)], axis=-1)
+        is_under = (aside < _TRIPOD * unit) & (offsets[..., 1:2] > 0.5 * unit)  # of each camera
         cost = distance * (1 + (_HIDDEN - 1) * (1 - clear))
-        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in views)) & ~is_below
+        is_seen = is_shown | (
+            (view in views) & ~is_under.any(axis=-1)
+        )  # what stands before a tripod does not replace it
+        is_seen &= (-(offsets @ normal) > _GRAZING * distance) & ~is_under[..., house.index(view)]
         ahead = shapely.Point(self.eyes[view][[0, 2]])
         if outline.contains(ahead) and outline.area < 0.999 * outline.convex_hull.area:
             flat = (places + _ASIDE * unit * normal)[..., (0, 2)][is_seen]
