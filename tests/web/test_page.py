@@ -227,11 +227,13 @@ def test_the_camera_stays_within_a_metre_of_a_single_photograph(
     assert header["spots"][0]["ahead"] == pytest.approx([0.4, -0.1], abs=1e-4)
 
 
-def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
-    merged = page_module._merge(flat, (0, 0, 1, 2), 800)
-    counts = np.bincount(merged.gaussians.views.numpy())
-    assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 200
-    assert torch.equal(merged.cam2world, flat.cam2world)
+def test_panoramas_of_all_parts_that_have_gaussians_keep_as_many(flat: Scene) -> None:
+    without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
+    for scene, count, third in ((flat, 800, 200), (without, 600, 0)):
+        merged = page_module._merge(scene, (0, 0, 1, 2), count)
+        counts = np.bincount(merged.gaussians.views.numpy())
+        assert counts[0] + counts[1] == 400 and counts[2] == third and counts[3] == 200
+        assert torch.equal(merged.cam2world, flat.cam2world)
 
 
 def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
@@ -243,13 +245,6 @@ def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
     assert page_module._find_flown_parts(flights, [(2, 3)]) == {0}
     alone = dataclasses.replace(flights, edges=(), parts=(0,) * 5)
     assert page_module._find_flown_parts(alone, ()) == {0}, "of a pair"
-
-
-def test_panoramas_without_gaussians_leave_them_to_others(flat: Scene) -> None:
-    without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
-    merged = page_module._merge(without, (0, 0, 1, 2), 600)
-    counts = np.bincount(merged.gaussians.views.numpy())
-    assert counts[0] + counts[1] == 400 and counts[2] == 0 and counts[3] == 200
 
 
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
