@@ -9,6 +9,7 @@ const DOLL_FOV = 45; // degrees, vertical, of a landscape picture
 const DOLL_PITCH = -45 * DEGREE; // pitch of the first view
 const LOWEST = -8 * DEGREE; // pitch of a camera that looks along the floor
 const DOLL_ZOOM = [0.15, 2]; // nearest and farthest, as factors of the distance from which all rooms are in the picture
+const BUTTONS = 56; // height of the row of buttons at the bottom, pixels
 const DOLL_TURN = Math.PI / 2; // radians a second, by keys
 
 // The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
@@ -36,29 +37,27 @@ export function frameDoll(size) {
   return { position: placeOutside(yaws[best], DOLL_PITCH), yaw: yaws[best], pitch: DOLL_PITCH, fov: DOLL_FOV };
 }
 
-// To the right and down: the share of the picture that the floor plan covers, at its left or in a portrait picture at its top, and
-// half of the size of the picture at a distance of 1.
+// To the right and down: the ends of what is free between the floor plan, at the left or in a portrait picture at the top, and the
+// buttons, -1 to 1; and half of the size of the picture at a distance of 1.
 function frame([width, height]) {
-  const tall = tangentOf(width, height, DOLL_FOV), [right, bottom] = state.doll.covered, isPortrait = height > width;
-  return [[isPortrait ? 0 : Math.min(right / width, 0.5), tall * width / height], [isPortrait ? Math.min(bottom / height, 0.5) : 0, tall]];
+  const tall = tangentOf(width, height, DOLL_FOV), isPortrait = height > width;
+  const [left, top] = state.doll.covered.map((end, k) => Number(isPortrait) === k ? Math.min(2 * end / [width, height][k], 1) - 1 : -1);
+  return [[left, 1, tall * width / height], [top, 1 - 2 * BUTTONS / height, tall]];
 }
 
-// The distance from which places around the middle are in the picture, beside the floor plan.
+// The distance from which places around the middle are in what is free.
 function fit(offsets, yaw, pitch, size) {
   const rotation = turned(yaw, pitch), sides = frame(size);
   const needed = offsets.map((offset) => {
     const [x, y, z] = inAxes(rotation, offset);
-    return Math.max(...sides.map(([covered, half], k) => {
-      const along = [x, y][k] / half;
-      return Math.max(along - z, (2 * covered - 1) * z - along) / (1 - covered);
-    }));
+    return Math.max(...sides.map(([low, high, half], k) => 2 * Math.max([x, y][k] / half - high * z, low * z - [x, y][k] / half) / (high - low)));
   });
   return 1.05 * needed.reduce((most, each) => Math.max(most, each));
 }
 
 // Where a camera with these angles sees all rooms, unless a visitor has come nearer.
 function placeOutside(yaw, pitch) {
-  const { center, offsets, size, first, zoom } = state.doll, aside = frame(size).map(([covered, half]) => covered * half);
+  const { center, offsets, size, first, zoom } = state.doll, aside = frame(size).map(([low, high, half]) => 0.5 * (low + high) * half);
   const distance = zoom * Math.max(first, fit(offsets, yaw, pitch, size));
   return minus(center, scaled(fromAxes(rotationOf({ yaw, pitch, roll: 0 }), [...aside, 1]), distance));
 }

@@ -416,7 +416,7 @@ def test_the_dolls_house_stays_in_the_picture_when_it_is_turned(node: str, tmp_p
     }"""
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
     distances, first, widths = run(node, tmp_path, header, program, (390, 844))
-    assert max(widths) <= 1 and min(distances) == pytest.approx(first) and max(distances) > 1.3 * first
+    assert max(widths) <= 1 and min(distances) == pytest.approx(first, rel=0.01) and max(distances) > 1.3 * first
 
 
 def test_the_dolls_house_is_beside_an_open_floor_plan_and_below_it_on_a_phone(node: str, tmp_path: Path) -> None:
@@ -430,7 +430,7 @@ def test_the_dolls_house_is_beside_an_open_floor_plan_and_below_it_on_a_phone(no
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
     for size, axis in (((720, 640), 0), ((320, 640), 1)):
         covered, free = (np.array(run(node, tmp_path, header, program, size, [bar, bar]))[:, axis] for bar in (300, 0))
-        assert min(covered) >= 300 and max(covered) <= size[axis] and min(free) < 300
+        assert min(covered) >= 300 and max(covered) <= size[axis] - 56 * axis and min(free) < 300, "above the buttons"
 
 
 def test_a_ray_meets_the_nearest_front_of_the_dolls_house(node: str, tmp_path: Path) -> None:
