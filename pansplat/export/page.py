@@ -191,14 +191,9 @@ def write_page(
     header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
     header["plan"] = _describe_plan(facts) if has_cameras else _NO_PLAN
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
-        spot["notes"] = [
-            {
-                "direction": _round(find_direction(pose, note.yaw, note.pitch).numpy()),
-                "text": note.text,
-                "addresses": note.addresses,
-            }
-            for note in photograph.context[0].notes
-        ]
+        for note in photograph.context[0].notes:
+            direction = _round(find_direction(pose, note.yaw, note.pitch).numpy())
+            spot["notes"].append({"direction": direction, "text": note.text, "addresses": note.addresses})
     for nodes, corners in zip(house.nodes, house.corners, strict=True):
         moves = [(turn, *_round(place - origin)) for turn, place in nodes.values()]
         corners = (corners - [*origin, 0, 0]).round(5).tolist()
@@ -422,8 +417,7 @@ def _describe_scene(
 
 def _describe_plan(facts: TourFacts) -> dict[str, Any]:
     """The floor plan: its drawing, and where the panoramas are on it."""
-    svg, size, places = draw_page_plan(facts.plan)
-    rooms = facts.plan.rooms
+    (svg, size, places), rooms = draw_page_plan(facts.plan), facts.plan.rooms
     return {
         "worlds": facts.tour.worlds,
         "rooms": [room.panoramas for room in rooms],
@@ -453,12 +447,8 @@ def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.n
     """Median distance of the Gaussians of each part from their cameras."""
     views = scene.gaussians.views.long()
     distances = (scene.gaussians.means.double() - scene.cam2world[views, :3, 3]).norm(dim=1).numpy()
-    reaches = np.full(parts.max() + 1, 1e-3)
-    for part in range(len(reaches)):
-        own = distances[parts[views] == part]
-        if len(own):
-            reaches[part] = max(float(np.median(own)), 1e-3)
-    return reaches
+    own = [distances[parts[views] == part] for part in range(parts.max() + 1)]
+    return np.array([max(float(np.median(each)) if len(each) else 0.0, 1e-3) for each in own])
 
 
 def _limit_parts(
@@ -466,9 +456,7 @@ def _limit_parts(
 ) -> list[float]:
     """How far the camera may move in each part from its edges; without edges, from the nearest panorama."""
     parts = list(flights.parts)
-    if not flights.edges:
-        if len(positions) == 1:
-            return [min(_SINGLE_REACH, 0.5 * float(reaches[0]))]
+    if not flights.edges and len(positions) > 1:
         distances = scipy.spatial.distance.cdist(positions, positions)
         longest_step = float(scipy.sparse.csgraph.minimum_spanning_tree(distances).toarray().max(initial=0.0))
         return [max(float(reaches[0]), 0.75 * longest_step)]

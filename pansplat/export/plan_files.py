@@ -35,10 +35,7 @@ _INCH = 0.0254  # metres
 _DOTS_PER_INCH = 150
 _MARGIN, _LINE = 0.8, 0.35  # around a storey, and between lines of notes, metres
 _TEXT, _SMALL_TEXT, _LEAST_TEXT = 0.22, 0.13, 0.08  # heights, metres
-_SMALL_SHEET, _SMALL_SHEET_TEXT = (
-    5.5,
-    0.17,
-)  # metres: width whose texts are legible in a quarter of a window; the largest
+_SMALL_SHEET, _SMALL_SHEET_TEXT = 5.5, 0.17  # metres: width and largest text that a quarter of a window shows legibly
 _LETTER = 0.72  # width of a letter, of its height
 _MEASURED = 0.6  # metres, the shortest wall whose length is written
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below

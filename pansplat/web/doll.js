@@ -9,7 +9,7 @@ const DOLL_FOV = 45; // degrees, vertical, of a landscape picture
 const DOLL_PITCH = -45 * DEGREE; // pitch of the first view
 const LOWEST = -8 * DEGREE; // pitch of a camera that looks along the floor
 const DOLL_ZOOM = [0.15, 2]; // nearest and farthest, as factors of the distance from which all rooms are in the picture
-const BUTTONS = 56; // height of the row of buttons at the bottom, pixels
+const BUTTON_ROW = 56; // height of the row of buttons at the bottom, pixels
 const DOLL_TURN = Math.PI / 2; // radians a second, by keys
 
 // The house of the panorama that the camera leaves: corners of triangles (x, y, z, and u, v in the atlas).
@@ -42,7 +42,7 @@ export function frameDoll(size) {
 function frame([width, height]) {
   const tall = tangentOf(width, height, DOLL_FOV), isPortrait = height > width;
   const [left, top] = state.doll.covered.map((end, k) => Number(isPortrait) === k ? Math.min(2 * end / [width, height][k], 1) - 1 : -1);
-  return [[left, 1, tall * width / height], [top, 1 - 2 * BUTTONS / height, tall]];
+  return [[left, 1, tall * width / height], [top, 1 - 2 * BUTTON_ROW / height, tall]];
 }
 
 // The distance from which places around the middle are in what is free.

@@ -27,6 +27,13 @@ export function showMore(isOpen) {
   byId("more").setAttribute("aria-expanded", isOpen);
 }
 
+// The text of the element before the script that runs. Both are removed: unlike text in a program, it is not kept.
+export function takeText() {
+  const { currentScript: script } = document, element = script.previousElementSibling;
+  [element, script].forEach((each) => each.remove());
+  return element.textContent;
+}
+
 // An element with children that are elements or text; text is never HTML.
 export function make(tag, className, ...children) {
   const element = document.createElement(tag);

@@ -2,7 +2,7 @@
 // has all views; one with a folder loads those that the camera needs.
 
 import { nodeHere } from "./camera.js";
-import { byId, canvas, say } from "./dom.js";
+import { byId, canvas, say, takeText } from "./dom.js";
 import { camera, currentPart, edges, isComplete, isSortedFor, parts, refresh, state } from "./state.js";
 
 const SILENCE_MS = 10000; // silence of a server after which a request has failed
@@ -32,14 +32,8 @@ function receive(view, isLast, chunk) {
   if (worker) worker.postMessage({ view, chunk, isLast });
 }
 
-// In a page of one file a script for each chunk of the data calls this. The chunk is the element before: unlike text in a
-// program, it is not kept.
-window.addPart = (view, isLast) => {
-  const { currentScript: script } = document, { previousElementSibling: element } = script;
-  element.remove();
-  script.remove();
-  receive(view, isLast, element.textContent);
-};
+// In a page of one file a script for each chunk of the data calls this.
+window.addPart = (view, isLast) => receive(view, isLast, takeText());
 
 // A file of the folder beside the page. A cache may hold what a server has answered in its place before.
 export async function fetchFile(name, isAgain) {

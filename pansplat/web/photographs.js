@@ -2,7 +2,7 @@
 // docs/web.md describes it. Tiles of cube faces are files, or text in a page of one file. A large level is drawn over the smallest one, as far as it has arrived.
 
 import { isFixed, nodeHere, nodeWithin, rotationOf, tangentOf } from "./camera.js";
-import { fullSize, say } from "./dom.js";
+import { fullSize, say, takeText } from "./dom.js";
 import { clamp, column, distanceOf, dot, fromAxes, inAxes, minus, multiply, scaled, unit } from "./graph.js";
 import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
@@ -22,14 +22,8 @@ const FACES = [
 ];
 const texts = new Map(); // base64 of the tiles that have arrived in a page of one file
 
-// In a page of one file there is a script for the smallest tiles of a photograph and one for the others; they are in the
-// element before.
-window.addTile = (name, number) => {
-  const { currentScript: script } = document, { previousElementSibling: element } = script;
-  element.textContent.split(" ").forEach((each, k) => texts.set(`${name}_${number + k}`, each));
-  element.remove();
-  script.remove();
-};
+// In a page of one file a script for the smallest tiles of a photograph calls this, and one for the others.
+window.addTile = (name, number) => takeText().split(" ").forEach((each, k) => texts.set(`${name}_${number + k}`, each));
 
 async function readTile({ key, tries }) {
   if (HEADER.folder !== null) {

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from pansplat.export.page import _bundle_programs
 from pansplat.export.page_data import PageConstants, PageHeader
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.pairs import Link, Panorama
@@ -51,6 +52,12 @@ def test_imports_of_the_modules_have_no_circle() -> None:
 def test_modules_that_need_no_browser_import_no_others() -> None:
     for name in WITHOUT_BROWSER:
         assert {other for _, other in IMPORT.findall(MODULES[name])} <= set(WITHOUT_BROWSER)
+
+
+def test_the_modules_share_one_scope(node: str, tmp_path: Path) -> None:
+    (tmp_path / "program.js").write_text(re.sub("</?script>", "", _bundle_programs()))
+    done = subprocess.run([node, "--check", tmp_path / "program.js"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_modules_read_all_fields_of_the_header() -> None:
