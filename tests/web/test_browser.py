@@ -34,7 +34,6 @@ from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import turn_axes
-from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.pairs import Note, Pair
 from pansplat.notebook import _bundle_scene
@@ -527,28 +526,6 @@ def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_ch
             page.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[1].position[i])")
 
 
-def test_a_page_of_small_and_large_units_is_that_of_metres(
-    chromium: Any, folder: Path, scene: Scene, photographs: list[Pair], tmp_path: Path
-) -> None:
-    seen, plans = [], []
-    for unit in (1.0, 1e3, 1e-3):
-        path = tmp_path / f"{unit:g}.html"
-        framed = dataclasses.replace(scene, frame=WorldFrame(unit))
-        write_page(framed, path, photographs=photographs, photo_height=256)
-        with opened(chromium, path, size=(640, 480)) as page:
-            position = page.run("HEADER.spots[0].position")
-            for offset in (0.02, 0.1):
-                pose = {"position": [position[0] + offset, *position[1:]], "yaw": 0, "pitch": 0}
-                page.look(**pose)
-                seen.append(page.draw())
-            page.page.keyboard.press("KeyM")
-            page.settle()
-            plans.append(page.run("document.getElementById('drawing').innerHTML"))
-    assert psnr(seen[0], seen[1]) < 25, "a photograph, and Gaussians"
-    assert "svg" in plans[0] and plans[0] == plans[1] == plans[2]
-    assert min(psnr(seen[k], seen[k % 2]) for k in range(2, 6)) > 45
-
-
 def test_flights_jumps_and_keys_end_alike(chromium: Any, folder: Path) -> None:
     """In the start view of the panorama; without one in the direction of the way."""
     with opened(chromium, folder / "tour.html", is_stepped=True) as page:
@@ -601,13 +578,7 @@ def test_a_room_without_a_flight_shows_its_photograph_only(chromium: Any, folder
         page.settle()
         page.run("pansplat.goTo(3), 0")
         page.wait("pansplat.isSettled() && pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
-        image, there = page.draw(), page.camera
-        assert image.min() > 0.1, "a photograph, and nothing black"
-        page.page.keyboard.down("KeyW")
-        page.run("step(90)")
-        page.page.keyboard.up("KeyW")
-        page.settle()
-        assert page.camera == there
+        assert page.draw().min() > 0.1, "a photograph, and nothing black"
         page.run("pansplat.camera.position[0] += 0.3")  # as a headset leaves it
         page.settle()
         assert page.draw().min() > 0.1
@@ -1413,18 +1384,6 @@ frame.src = location.hash.slice(1);
 </script>"""
 
 
-@contextmanager
-def in_a_host(chromium: Any, origin: str, page: str, **options: Any) -> Iterator[tuple[OpenPage, Any]]:
-    """A page of an origin with the page at another address in an <iframe>, and the loaded frame."""
-    context = new_context(chromium, viewport={"width": 500, "height": 400}, **options)
-    host = OpenPage(context.new_page())
-    host.page.goto(f"{origin}/host.html#{page}")
-    frame = host.page.frames[1]
-    frame.evaluate("pansplat.ready")
-    yield host, frame
-    context.close()
-
-
 @pytest.mark.slow
 def test_no_other_page_shows_a_served_page_in_a_frame(chromium: Any, sites: Sites, folder: Path) -> None:
     with PageServer(PageFiles((folder / "house.html",), 0, 0)) as server:
@@ -1439,36 +1398,40 @@ def test_no_other_page_shows_a_served_page_in_a_frame(chromium: Any, sites: Site
 
 @pytest.mark.slow
 def test_the_wheel_is_the_host_pages_until_a_click(chromium: Any, sites: Sites, folder: Path) -> None:
-    with in_a_host(chromium, sites.host, f"{sites.pages}/tour.html") as (host, frame):
-        mouse, fov = host.page.mouse, frame.evaluate("pansplat.camera.fov")
-        place = (150, 180)
+    host = OpenPage(new_context(chromium, viewport={"width": 500, "height": 400}).new_page())
+    host.page.goto(f"{sites.host}/host.html#{sites.pages}/tour.html")
+    frame = host.page.frames[1]
+    frame.evaluate("pansplat.ready")
+    mouse, fov = host.page.mouse, frame.evaluate("pansplat.camera.fov")
+    place = (150, 180)
 
-        def scrolls(pixels: int) -> bool:
-            """Whether the wheel scrolls the host, and not the field of view."""
-            before = host.run("scrollY"), frame.evaluate("pansplat.camera.fov")
-            frame.evaluate("turned = 0; onwheel = () => { turned += 1; }")  # after the page's listener
-            mouse.wheel(0, pixels)
-            wait_until(frame, "turned")
-            if frame.evaluate("pansplat.camera.fov") != before[1]:
-                assert host.run("scrollY") == before[0]
-                return False
-            host.wait(f"scrollY === {before[0] + pixels}")
-            return frame.evaluate("pansplat.camera.fov") == before[1]
+    def scrolls(pixels: int) -> bool:
+        """Whether the wheel scrolls the host, and not the field of view."""
+        before = host.run("scrollY"), frame.evaluate("pansplat.camera.fov")
+        frame.evaluate("turned = 0; onwheel = () => { turned += 1; }")  # after the page's listener
+        mouse.wheel(0, pixels)
+        wait_until(frame, "turned")
+        if frame.evaluate("pansplat.camera.fov") != before[1]:
+            assert host.run("scrollY") == before[0]
+            return False
+        host.wait(f"scrollY === {before[0] + pixels}")
+        return frame.evaluate("pansplat.camera.fov") == before[1]
 
-        mouse.move(*place)
-        assert scrolls(30) and scrolls(-30)
-        assert frame.evaluate("pansplat.camera.fov") == fov and "Click" in frame.inner_text("#status")
-        touch_action = "document.getElementById('view').style.touchAction"
-        assert frame.evaluate(touch_action) == "pan-y", "a finger scrolls the host"
-        mouse.click(*place)
-        assert not scrolls(30) and frame.evaluate(touch_action) == "none"
-        host.page.keyboard.press("Escape")
-        assert scrolls(30) and scrolls(-30)
-        mouse.click(*place)
-        assert not scrolls(30)
-        mouse.move(20, 20)
-        mouse.move(*place)
-        assert scrolls(30)
+    mouse.move(*place)
+    assert scrolls(30) and scrolls(-30)
+    assert frame.evaluate("pansplat.camera.fov") == fov and "Click" in frame.inner_text("#status")
+    touch_action = "document.getElementById('view').style.touchAction"
+    assert frame.evaluate(touch_action) == "pan-y", "a finger scrolls the host"
+    mouse.click(*place)
+    assert not scrolls(30) and frame.evaluate(touch_action) == "none"
+    host.page.keyboard.press("Escape")
+    assert scrolls(30) and scrolls(-30)
+    mouse.click(*place)
+    assert not scrolls(30)
+    mouse.move(20, 20)
+    mouse.move(*place)
+    assert scrolls(30)
+    host.page.context.close()
 
 
 @pytest.mark.slow
