@@ -40,8 +40,8 @@ export function frameDoll(size) {
 // To the right and down: the ends of what is free between the floor plan, at the left or in a portrait picture at the top, and the
 // buttons, -1 to 1; and half of the size of the picture at a distance of 1.
 function frame([width, height]) {
-  const tall = tangentOf(width, height, DOLL_FOV), isPortrait = height > width;
-  const [left, top] = state.doll.covered.map((end, k) => Number(isPortrait) === k ? Math.min(2 * end / [width, height][k], 1) - 1 : -1);
+  const tall = tangentOf(width, height, DOLL_FOV), [right, bottom] = state.doll.covered;
+  const [left, top] = height > width ? [-1, Math.min(2 * bottom / height, 1) - 1] : [Math.min(2 * right / width, 1) - 1, -1];
   return [[left, 1, tall * width / height], [top, 1 - 2 * BUTTON_ROW / height, tall]];
 }
 

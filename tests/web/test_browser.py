@@ -327,6 +327,11 @@ def home(page: OpenPage) -> OpenPage:
     return page
 
 
+def aim(level: np.ndarray, camera: dict[str, Any]) -> np.ndarray:
+    """The axes of a camera of the page, whose numbers may be integers."""
+    return turn_axes(level.astype(float), float(camera["yaw"]), float(camera["pitch"]))
+
+
 def draw_reference(
     scene: Scene, level: np.ndarray, origin: np.ndarray, camera: dict[str, Any], size: tuple[int, int] = SIZE
 ) -> np.ndarray:
@@ -341,7 +346,7 @@ def render_reference(
 ) -> Any:
     """The rasteriser's picture and depth for a camera of the page."""
     pose = np.eye(4)
-    pose[:3, :3] = turn_axes(level, camera["yaw"], camera["pitch"])
+    pose[:3, :3] = aim(level, camera)
     pose[:3, 3] = camera["position"] + origin
     options = {"size": size[::-1], "layout": "pinhole", "vertical_fov_degrees": camera["fov"]}
     return pipeline.render(scene, pose, **options)
@@ -424,7 +429,7 @@ def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_bac
         # Where the rays of the pixels meet the floor, and what the nearest camera shows there.
         y, x = (np.mgrid[: SIZE[1], : SIZE[0]] + 0.5 - np.array((SIZE[1], SIZE[0]))[:, None, None] / 2) / SIZE[1] * 2
         tangent = math.tan(math.radians(45 / 2))
-        turned = turn_axes(level, camera["yaw"], camera["pitch"])
+        turned = aim(level, camera)
         rays = np.stack((x * tangent, y * tangent, np.ones_like(x)), axis=-1) @ turned.T
         eye, down = camera["position"] + origin, rooms.level[:, 1]
         floor = float(np.mean(cameras @ down + rooms.floors))
@@ -674,7 +679,7 @@ def look_at_photograph(photograph: Pair, level: np.ndarray, camera: dict[str, An
     tangent = math.tan(math.radians(camera["fov"]) / 2)
     y, x = ((2 * (np.arange(side) + 0.5) - side) / height * tangent for side in (height, width))
     rays = np.stack((*np.meshgrid(x, y), np.ones((height, width))), axis=-1)
-    turned = turn_axes(level, camera["yaw"], camera["pitch"])
+    turned = aim(level, camera)
     rays = torch.from_numpy(rays @ (panorama.cam2world[:3, :3].numpy().T @ turned).T)
     seen = sample_equirect(image, uv_from_directions(rays).float()).permute(1, 2, 0).double().numpy()
     return seen.reshape(SIZE[1], 3, SIZE[0], 3, 3).mean(axis=(1, 3))
