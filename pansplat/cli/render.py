@@ -205,14 +205,14 @@ class Render(Computation):
 
 def _plan_route(scene: Scene) -> Route | None:
     """The way through a tour; None for another scene."""
-    from pansplat.tours.merge import make_graph
+    from pansplat.tours.facts import TourFacts
     from pansplat.tours.route import REST_SECONDS, plan_route
     from pansplat.tours.walks import plan_walk
 
     if scene.tour is None:
         return None
-    tour = make_graph(scene)
-    return plan_route(tour, plan_walk(tour), rest=REST_SECONDS)
+    facts = TourFacts(scene)
+    return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
 def read_pose(path: Path) -> Tensor:

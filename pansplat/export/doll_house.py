@@ -36,21 +36,21 @@ from pansplat.refinement.fusion import BACKGROUND_LEVEL, are_seen, measure_reach
 from pansplat.tours.doll_house import Rooms
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
-_TOP = 0.94  # of the ceiling's height over the cameras: height of the walls
-_DOOR, _PARALLEL = 0.6, 0.9  # of the same: height of doors, below the band of walls; cosine between a door and its wall
+_TOP, _DOOR = 0.94, 0.6  # heights of walls and doors over the cameras, as shares of the ceiling's height there
+_PARALLEL = 0.9  # least cosine between a door and its wall
 _BEHIND = 0.4  # farthest room behind a door, and distance of the two sides of a wall
-_THICK = 0.07  # of the walls, seen from above
+_THICK = 0.07  # thickness of the walls, seen from above
 _STEP = 0.06  # between two places where cameras are compared
-_SOFT, _WIDE = 1.0, 4.0  # of these places: where one camera replaces another; over which hidden ones are averaged
-_TRIPOD = 0.35  # radius of the floor around a camera, which its photograph does not show
-_EDGE, _EDGE_SOFT = 0.05, 0.03  # of a wall's width beside an unseen wall; of its height over which colours are averaged
+_SOFT, _WIDE = 1.0, 4.0  # widths in such steps: of the border of two cameras; over which hidden places are averaged
+_TRIPOD = 0.42  # radius of the floor around a camera, which its photograph does not show
+_EDGE, _EDGE_SOFT = 0.05, 0.03  # shares of the width and the height of a wall whose colours go on beside it
 _GRAZING, _ASIDE = 0.02, 0.05  # least cosine between a ray and the normal of a surface; from a wall to where it is seen
-_THROUGH, _OPEN = 1.3, 0.6  # of the distance of a wall that a camera sees through; share of its places
+_THROUGH, _OPEN = 1.3, 0.6  # an open wall: the camera sees to this factor of its distance, at this share of its places
 _HIDDEN = 4.0  # factor of the distance of a camera whose surfaces are in front
 _ATLAS, _MARGIN = 2048, 4  # side of the atlas, and space around each texture, texels
 _FINEST = 150.0  # texels along a camera's height
-_REACH_ROWS, _PHOTO_ROWS = 256, 1024  # of the surfaces and the photographs
-_QUALITY, _KEPT = 80, 16  # of WebP; photographs in memory
+_REACH_ROWS, _PHOTO_ROWS = 256, 1024  # rows of the images of surfaces, and of the photographs
+_QUALITY, _KEPT = 80, 16  # quality of WebP; number of photographs in memory
 
 Gap = tuple[int, Polygon, Float[np.ndarray, "2"], float]
 """A room with a gap to another one, the ground between them, the direction of the wall, and the upper edge."""
@@ -374,9 +374,13 @@ class _Painter:
         world = torch.from_numpy(places.reshape(-1, 3)) @ self.level.T
         is_shown = are_seen(world, self.poses[view], self.reaches[view]).numpy().reshape(distance.shape)
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
-        is_below = (np.hypot(offsets[..., 0], offsets[..., 2]) < _TRIPOD * unit) & (offsets[..., 1] > 0.5 * unit)
+        house = list(self.rooms.houses[panel.house])
+        aside = np.linalg.norm((places[..., None, :] - self.eyes[house])[..., (0, 2)], axis=-1)
+        is_under = (aside < _TRIPOD * unit) & (offsets[..., 1:2] > 0.5 * unit)  # of each camera
         cost = distance * (1 + (_HIDDEN - 1) * (1 - clear))
-        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in room.panoramas)) & ~is_below
+        # What stands before a tripod does not replace it.
+        is_seen = is_shown | ((view in room.panoramas) & ~is_under.any(axis=-1))
+        is_seen &= (-(offsets @ normal) > _GRAZING * distance) & ~is_under[..., house.index(view)]
         ahead = shapely.Point(self.eyes[view][[0, 2]])
         outline = room.shape
         if outline.contains(ahead) and outline.area < 0.999 * outline.convex_hull.area:

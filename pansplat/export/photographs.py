@@ -38,8 +38,8 @@ from pansplat.tours.graph import TourGraph
 from pansplat.tours.merge import make_graph, select_views
 from pansplat.tours.scene_views import choose_scene_views
 
-MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
-MAX_HEIGHT = 4096  # of a photograph in a folder
+MIN_HEIGHT = 1024  # least height of a photograph in a page, pixels, unless its file is smaller
+MAX_HEIGHT = 4096  # largest height of a photograph in a folder, pixels
 _FACE = 2 / math.pi  # largest size of a face, of the photograph's height: its centre is as dense
 _STEP = 16  # divides the size of a face, pixels
 _LABEL = 40  # letters of the name of a panorama in names of files
@@ -47,9 +47,9 @@ _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
 _TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
 # Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
 _QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
-_SHRINK = 0.95  # of a height that is too large for the page, at most
-_HIDDEN_ROWS = 512  # of the image of the Gaussians in what masks hide
-_GUARD, _FEATHER = 3, 1 / 128  # around it: pixels of which nothing is shown, and of the height, which fade
+_SHRINK = 0.95  # largest factor of the next height, where one is too large for the page
+_HIDDEN_ROWS = 512  # rows of the image of the Gaussians that replaces what masks hide
+_GUARD, _FEATHER = 3, 1 / 128  # borders of what masks hide: hidden pixels, and a share of the height that fades
 
 
 @dataclass(frozen=True, eq=False)

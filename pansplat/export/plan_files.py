@@ -35,10 +35,7 @@ _INCH = 0.0254  # metres
 _DOTS_PER_INCH = 150
 _MARGIN, _LINE = 0.8, 0.35  # around a storey, and between lines of notes, metres
 _TEXT, _SMALL_TEXT, _LEAST_TEXT = 0.22, 0.13, 0.08  # heights, metres
-_SMALL_SHEET, _SMALL_SHEET_TEXT = (
-    5.5,
-    0.17,
-)  # metres: width whose texts are legible in a quarter of a window; the largest
+_SMALL_SHEET, _SMALL_SHEET_TEXT = 5.5, 0.17  # metres: width and largest text that a quarter of a window shows legibly
 _LETTER = 0.72  # width of a letter, of its height
 _MEASURED = 0.6  # metres, the shortest wall whose length is written
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
@@ -249,7 +246,9 @@ class _Drawing:
             (_SMALL_SHEET_TEXT, _SMALL_TEXT, 0.75 * _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
         )
         large, small, least = (self.enlarged * size for size in sizes)
-        taken = shapely.MultiPoint(self.panoramas).buffer(small) | shapely.box(0, 0, *self.size).exterior.buffer(0.01)
+        taken = shapely.MultiPoint(self.panoramas).buffer(0.7 * small) | shapely.box(0, 0, *self.size).exterior.buffer(
+            0.01
+        )
         texts: list[_Text] = []
 
         def add(*options: _Text) -> None:
@@ -275,8 +274,8 @@ class _Drawing:
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
                 name = self.plan.tour.panoramas[node].label
-                away = 1.5 * small + _LETTER * small * len(name) / 2
-                places = (x + away, y), (x - away, y), (x, y + 2 * small), (x, y - 2 * small)
+                away, beyond = 1.1 * small + _LETTER * small * len(name) / 2, 1.3 * small
+                places = (x + away, y), (x - away, y), (x, y + beyond), (x, y - beyond)
                 options = [_Text("PANORAMAS", place, name, small) for place in places]
                 add(*sorted(options, key=lambda text: LineString(((x, y), text.place)).intersects(walls)))
         for room, corners in [each for each in outlines.items() if each[0].is_closed and not self.is_small]:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from pansplat.geometry.path import turn_axes, wrap_angle
 from pansplat.tours.graph import Edge, TourGraph
-from pansplat.tours.outlook import find_widest
+from pansplat.tours.outlook import find_bins, find_turns, find_widest
 
 FADE_SECONDS = 1.0  # duration of the fade between two scenes
 NEAR_OF_FAR = 0.03  # Gaussians of a tour within this fraction of far are not drawn, because ways pass door frames
@@ -163,7 +163,8 @@ def plan_route(
     rest: float = 0.0,
     outlooks: Mapping[int, Float[np.ndarray, "bin"]] | None = None,
 ) -> Route:
-    """A way along a walk. It ends in the start view of its last panorama, else in the direction of arrival.
+    """A way along a walk. It ends in the start view of its last panorama, else in the direction of arrival, turned from
+    a wall that is close.
 
     Args:
         tour: the graph.
@@ -171,8 +172,8 @@ def plan_route(
         start: pose from which the first node is approached; None starts at that node, in the direction of its start
             view, or of the second node.
         rest: seconds at each panorama on the first visit, in its start view.
-        outlooks: of panoramas (`measure_outlook`), in whose widest view a zoom to another world ends if nothing else is
-            stated.
+        outlooks: of panoramas (`measure_outlook`), which show walls that are close (`find_turns`), and the widest view,
+            in which a zoom to another world ends if nothing else is stated.
     """
     planner = _Planner(tour, outlooks or {})
     planner.begin(walk, start)
@@ -181,7 +182,7 @@ def plan_route(
         is_visit = rest > 0 and node not in walk[:number] and (start is None or len(planner.steps) > 0)
         has_zoomed = len(planner.steps) > 0 and planner.steps[-1].kind == "zoom"
         if (is_visit or number == len(walk) - 1) and not has_zoomed:
-            planner.turn(find_start_angles(tour, node))
+            planner.turn(find_start_angles(tour, node) or planner.avoid_wall(node, *planner.camera[3:]))
         if is_visit:
             planner.add("rest", planner.camera, rest)
     if not planner.steps or planner.steps[-1].kind == "zoom":
@@ -261,15 +262,21 @@ class _Planner:
             return yaw, max(pitch, LOWEST_PITCH)
         return (math.atan2(away[0], away[2]), 0.0) if self.tour.worlds[start] == self.tour.worlds[end] else None
 
-    def find_arrival(self, start: int, end: int) -> Sequence[float]:
+    def find_arrival(self, start: int, end: int) -> tuple[float, float]:
         """Yaw and pitch at the end of a zoom: away from the link back, else the start view, else that of the way."""
         if (back := self.tour.find_direction(end, start)) is not None:
             right, _, forward = -back
-            return math.atan2(right, forward), 0.0
-        is_known = self.tour.worlds[start] == self.tour.worlds[end] or end not in self.outlooks
-        return find_start_angles(self.tour, end) or (
-            self.camera[3:].tolist() if is_known else (find_widest(self.outlooks[end]), 0.0)
-        )
+            return self.avoid_wall(end, math.atan2(right, forward), 0.0)
+        if (view := find_start_angles(self.tour, end)) is not None:
+            return view
+        if self.tour.worlds[start] != self.tour.worlds[end] and end in self.outlooks:
+            return find_widest(self.outlooks[end]), 0.0
+        return self.avoid_wall(end, *self.camera[3:])
+
+    def avoid_wall(self, node: int, yaw: float, pitch: float) -> tuple[float, float]:
+        """The yaw and pitch of an arrival, turned away from a wall that is close."""
+        turn = find_turns(self.outlooks[node])[find_bins(np.array(yaw))] if node in self.outlooks else 0.0
+        return float(yaw + turn), float(pitch)
 
 
 def find_start_angles(tour: TourGraph, node: int) -> tuple[float, float] | None:

@@ -170,13 +170,23 @@ def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
         away = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2)
         floor = (np.abs(y - FLOOR) < 1e-6) & (x < 4.9) & (x > 1.0)
         clear = floor & (np.abs(away[:, 0] - away[:, 1]) > 0.3)
-        tripod = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2).min(axis=1) < np.hypot(FLOOR, 0.6)
+        tripod = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2).min(axis=1) < np.hypot(FLOOR, 0.7)
         assert (own[clear & ~tripod] == 2 * (away[:, 1] < away[:, 0])[clear & ~tripod]).all()
         for number, camera in enumerate(CAMERAS[:2]):
             below = floor & (np.hypot(x - camera[0], z - camera[2]) < 0.25)
             assert below.sum() > 5 and (own[below] == 2 - 2 * number).all(), "the tripod"
         behind = (x < 1e-6) & (np.abs(z - 2) < 0.6) & (np.abs(y) < 0.5)
         assert behind.sum() > 5 and (own[behind] == expected).all(), "a surface is in front of the wall"
+
+
+def test_what_stands_before_the_floor_below_another_camera_does_not_replace_it(scene: Scene, rooms: Rooms) -> None:
+    wall = see_box(np.array((1.4, -2, 1.0)), np.array((1.5, 2, 3.0)), np.array((1.45, 0, 2)), 4000)
+    hidden = Gaussians.cat([scene.gaussians, make_balls(wall, 0.03, views=0)])
+    floor = next(panel for panel in build_panels(rooms, lambda *_: False) if panel.room == 0 and panel.down[1] == 0)
+    places = (np.array(((3.8, FLOOR, 2.3), (3.0, FLOOR, 2.2))) - floor.corner) @ np.stack((floor.right, floor.down), 1)
+    for shown, expected in ((scene, [True, True]), (dataclasses.replace(scene, gaussians=hidden), [False, True])):
+        cost = _Painter(shown, rooms, ())._judge(floor, places[None], 0, FLOOR)
+        assert np.isfinite(cost[0]).tolist() == expected, "below the second camera, and beside that"
 
 
 def test_what_no_camera_sees_has_the_colours_around_it() -> None:

@@ -64,8 +64,6 @@ def _matched(height: int = 64, views: int = 2, batch: int = 1) -> MatchedViews:
     return MatchedViews(images, features, Depths(tuple(sweeps)), poses, near, far)
 
 
-
-
 def _difference(a: Gaussians, b: Gaussians) -> float:
     assert torch.equal(a.levels, b.levels) and torch.equal(a.views, b.views)
     return max(float((getattr(a, name) - getattr(b, name)).detach().abs().max()) for name in _FIELDS)

@@ -164,6 +164,19 @@ def test_a_zoom_without_a_link_grows_where_the_camera_looks_and_arrives_in_the_s
     assert np.allclose(viewed.pose(1)[:3, 2], _look(tour, 4))
 
 
+def test_a_way_ends_beside_a_wall_that_is_close_unless_a_start_view_is_stated(comb, home):
+    closed = np.full(24, 4.0)
+    closed[8:16] = 0.5  # ahead
+    walls = dict.fromkeys(range(7), closed)
+    for tour, walk in ((comb, [0, 1]), (home, [2, 3])):  # a flight, a zoom away from the link back
+        start = _start(tour, walk[0])
+        straight, turned = (plan_route(tour, walk, start, outlooks=seen).pose(1) for seen in ({}, walls))
+        assert np.allclose(straight[:3, 2], (0, 0, 1)) and 30 <= _angle(straight, turned) <= 60
+    panoramas = tuple(dataclasses.replace(view, start=(0.0, 0.0)) for view in comb.panoramas)
+    stated = dataclasses.replace(comb, panoramas=panoramas)
+    assert np.allclose(plan_route(stated, [0, 1], _start(comb, 0), outlooks=walls).pose(1)[:3, 2], (0, 0, 1))
+
+
 def test_along_a_poor_edge_the_camera_zooms_in_the_direction_of_the_other_panorama(comb):
     poor = dataclasses.replace(comb, poor=((1, 4),))
     route = plan_route(poor, [0, 1, 4], _start(poor, 0))
