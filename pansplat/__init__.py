@@ -5,10 +5,6 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from pansplat.system.kernel_cache import choose_kernel_cache
-
-choose_kernel_cache(os.path.dirname(__file__), os.environ)
-
 # Threads of torch's operations sleep while they wait. By default they spin for milliseconds: beside another process, an
 # operation of half a millisecond on two threads takes six to nineteen.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

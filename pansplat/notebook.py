@@ -48,7 +48,7 @@ def show(scene: Scene | str | Path, *, gaussians: int = DISPLAY_GAUSSIANS, heigh
     Args:
         scene: the scene, or its file.
         gaussians: largest number of Gaussians. In a notebook they are a part of its file, about 24 bytes each.
-        height: of the frame in a notebook, pixels.
+        height: rows of the frame in a notebook.
 
     Returns:
         The temporary page, without a notebook.

@@ -23,7 +23,7 @@ from pansplat.cache import CachedScene, _is_valid
 from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.gaussians.scene_files import format_entry, make_scene
 from pansplat.images.cube_images import CubeImage, CubeLevel, write_cube
 from pansplat.images.image_files import read_depth, read_height, read_panorama, write_image
@@ -56,9 +56,8 @@ SCENE = Scene(
     model="sweep",
     height=64,
     gains=((1.0, 1.0, 1.0), (1.0, 0.9, 1.0)),
-    overlaps=((0, 1, 0.5),),
-    links=((0, 1, 0.1, 0.2, "door"),),
     starts=((0.1, 0.2), None),
+    tour=SceneTour(((0, 1, 0.5),), ((0, 1, 0.1, 0.2, "door"),)),
 )
 
 

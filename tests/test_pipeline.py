@@ -1,5 +1,6 @@
 """Predict into memory or a file, render, save and load."""
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -25,7 +26,9 @@ from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load, load_sets, predict, predict_to_file, predict_tour, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
-from pansplat.tours.graph import TourGraph, find_tours, select_views
+from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.tours.merge import select_views
+from pansplat.tours.scene_views import choose_sources
 
 HEIGHT = 16
 
@@ -145,7 +148,7 @@ def test_a_folder_of_several_pairs_names_the_call_for_all_of_it_which_takes_its_
     house = write_tour(tmp_path / "house", 4)
     expect_error(r"holds 3 pairs .*predict_tour", lambda: predict(house, sphere_predictor()))
     scene = predict_tour(house, sphere_predictor(), height=64, cache=False)
-    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.overlaps) >= 3
+    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.tour.overlaps) >= 3
     expect_error("0 tours", lambda: predict_tour(write_pair(tmp_path / "pair"), sphere_predictor()))
 
 
@@ -166,7 +169,7 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
     torch.testing.assert_close(*colors, atol=1e-5, rtol=0)
     others = render(select_views(cut, (2, 3)), pose, size=(32, 64))
     assert (drawn.alpha[hole] == others.alpha[hole]).all() and others.alpha[hole].min() > 0.9
-    assert not torch.allclose(of_edge.color, render(replace(cut, overlaps=()), pose, size=(32, 64)).color, atol=0.05)
+    assert not torch.allclose(of_edge.color, render(replace(cut, tour=None), pose, size=(32, 64)).color, atol=0.05)
 
 
 @pytest.mark.parametrize("blending", ["deferred", "joint"])
@@ -177,7 +180,7 @@ def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
-    assert [edge[:2] for edge in whole.overlaps] == [(0, 1), (2, 2)]
+    assert [edge[:2] for edge in whole.tour.overlaps] == [(0, 1), (2, 2)]
     options = {"size": (32, 64), "blend": blending}
     for views in ((0, 1), (2,)):
         pose = tour.cam2world[views[0]].clone()
@@ -284,6 +287,8 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     count = predict_to_file(masked_pair, tmp_path / "tiles.ply", weights, height=TILED_HEIGHT)
     tiles = load(tmp_path / "tiles.ply")
     assert count == len(tiles.gaussians) == len(scene.gaussians) > 1000
+    assert count == predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
+    assert count == len(load(tmp_path / "tiles.glb").gaussians)
     assert 0 < int((tiles.gaussians.views == 0).sum()) < int((tiles.gaussians.views == 1).sum())  # masked
     np.testing.assert_allclose(_sorted_columns(tiles.gaussians), _sorted_columns(whole.gaussians), atol=1e-5)
     assert not torch.equal(tiles.gaussians.means, whole.gaussians.means)  # ordered by tile
@@ -317,13 +322,6 @@ def test_the_predict_command_streams_large_predictions(
     np.testing.assert_allclose(_sorted_columns(tiles), _sorted_columns(whole), atol=1e-5)
 
 
-@pytest.mark.slow
-def test_tiles_are_written_in_every_format(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
-    count = predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
-    scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
-    assert count == len(scene.gaussians) == len(load(tmp_path / "tiles.glb").gaussians)
-
-
 def test_predictions_are_written_in_the_format_of_the_suffix(
     pair_folder: Path, tmp_path: Path, sphere_predictor: type
 ) -> None:
@@ -341,10 +339,10 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
     (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     predictor = sphere_predictor()
     scene = predict_tour(tour, predictor, cache=False)
-    assert predictor.calls == len(tour.choose_sources()) == 3
+    assert predictor.calls == len(choose_sources(tour)) == 3
     assert scene.gaussians.views.bincount().tolist() == [64 * 128] * 4  # the smallest height
     assert scene.cam2world.equal(tour.cam2world) and scene.names == tuple(f"p{k}" for k in range(4))
-    assert [edge[:2] for edge in scene.overlaps] == list(tour.overlaps)
+    assert [edge[:2] for edge in scene.tour.overlaps] == list(tour.overlaps)
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))
     predictor.calls, predictor.max_views = 0, 4
@@ -421,22 +419,29 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return write
 
 
+@pytest.fixture(scope="module")
+def predict_room(room: Callable[[str], Path]) -> Callable[..., Scene]:
+    """Predict the room of a frame, its places moved in the working world, at 64 rows; each once."""
+
+    @functools.cache
+    def run_prediction(name: str, *moved: float) -> Scene:
+        views = load_sets(room(name))[0].load_context(64)
+        cam2world = views.cam2world.clone()
+        cam2world[:, :3, 3] += torch.tensor(moved or (0.0, 0.0, 0.0), dtype=torch.float64)
+        return predict(replace(views, cam2world=cam2world), "sweep")
+
+    return run_prediction
+
+
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
 def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
-    name: str, room: Callable[[str], Path]
+    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene]
 ) -> None:
     unit, origin = FRAMES[name]
     # An origin of the working world is a multiple of 64 m; that of the poses is not.
-    moved = torch.tensor([0.0, 32.0, 16.0] if origin else [0.0] * 3, dtype=torch.float64)
-    (in_metres,), (pair,) = load_sets(room("metres")), load_sets(room(name))
-    views = in_metres.load_context(64)
-    cam2world = views.cam2world.clone()
-    cam2world[:, :3, 3] += moved
-    views = replace(views, cam2world=cam2world)
-    found = pair.load_context(64)
-    assert torch.equal(found.cam2world, cam2world) and (found.near, found.far) == (views.near, views.far)
-    assert found.frame.unit == unit
-    expected, scene = predict(views, "sweep"), predict(pair, "sweep", height=64, cache=False)
+    expected, scene = predict_room("metres", *((0.0, 32.0, 16.0) if origin else ())), predict_room(name)
+    assert torch.equal(scene.cam2world, expected.cam2world) and scene.frame.unit == unit
+    assert (scene.near, scene.far) == (expected.near, expected.far)
     for field in fields(Gaussians):
         assert torch.equal(getattr(scene.gaussians, field.name), getattr(expected.gaussians, field.name)), field.name
     size = (64, 128)
@@ -447,15 +452,14 @@ def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
 
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
 def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
-    name: str, room: Callable[[str], Path], tmp_path: Path
+    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene], tmp_path: Path
 ) -> None:
-    folder, size, unit = room(name), (64, 128), FRAMES[name][0]
-    scene = predict(folder, "sweep", height=64, cache=False)
+    folder, size, unit, scene = room(name), (64, 128), FRAMES[name][0], predict_room(name)
     ours = render(scene, scene.cam2world[0], size=size).color
     pose = json.loads((folder / "poses.json").read_text())["poses"]["left.jpg"]["cam2world"]
     users = torch.tensor(pose, dtype=torch.float64)
-    suffixes = ("ply", "glb", "compressed.ply", "sog", *(["spz"] if unit == 1 else []))  # .spz ends at 2048
-    for file in (f"scene.{suffix}" for suffix in suffixes):
+    coded = {"millimetres": ("compressed.ply", "sog"), "UTM": ("compressed.ply", "spz"), "UTM in millimetres": ()}
+    for file in (f"scene.{suffix}" for suffix in ("ply", "glb", *coded[name])):
         save(scene, tmp_path / file)
         loaded = load(tmp_path / file)
         torch.testing.assert_close(loaded.frame.globalize(loaded.cam2world)[0], users, rtol=1e-12, atol=1e-7)
@@ -472,11 +476,9 @@ def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
 
 
 def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(
-    room: Callable[[str], Path], tmp_path: Path
+    room: Callable[[str], Path], predict_room: Callable[..., Scene]
 ) -> None:
-    (pair,) = load_sets(room("UTM"))
-    views = pair.load_context(64)
-    scene = predict(views, "sweep")
+    views, scene = load_sets(room("UTM"))[0].load_context(64), predict_room("UTM")
     x, y, z = scene.frame.origin
     frame = replace(scene.frame, origin=(x - 512.0, y, z))
     moved = replace(views, frame=frame, cam2world=frame.localize(scene.frame.globalize(scene.cam2world)))

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from pansplat.errors import InputError
-from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, write_film
+from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
-from pansplat.tours.graph import TourGraph, make_graph
-from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route, plan_visits
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.merge import make_graph
+from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
+from pansplat.tours.walks import plan_walk
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry, make_file_name
 from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.core.state import fit_settings
@@ -100,7 +102,7 @@ def write_flight(
     if tour is None and not len(scene.cam2world):
         raise InputError("the scene has no input cameras to fly between; give a path to `pansplat render --path`")
     folder.mkdir(parents=True, exist_ok=True)
-    route = plan_visits(scene) if tour is None else plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+    route = plan_visits(scene) if tour is None else plan_route(tour, plan_walk(tour), rest=REST_SECONDS)
     shots, panoramas = list_flight(route, fps, FIELD_OF_VIEW, seconds), (tour or make_graph(scene)).panoramas
     stills: dict[int, list[str]] = {}
     for node, at in route.visits.items():

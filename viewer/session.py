@@ -17,7 +17,7 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.inputs.panorama_sets import Panorama
-from pansplat.tours.graph import list_starts
+from pansplat.tours.merge import list_starts
 from pansplat.tours.route import REST_SECONDS, Route
 from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.hotspots import PlaceFacts

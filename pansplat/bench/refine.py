@@ -45,8 +45,8 @@ class RefineCase:
 
     Attributes:
         model: name of a predictor, or `CROSS_FADE`.
-        height: of the panoramas, pixels.
-        limit_steps: of the refinement; 0 for none.
+        height: rows of the panoramas.
+        limit_steps: largest number of steps of the refinement; 0 for none.
         limit_gaussians: None for no limit.
         views: number of the pair's panoramas that the scene is made of; None for all.
     """

@@ -109,6 +109,7 @@ def _leave_out_each(path: Path, pairs: Sequence[PanoramaSet]) -> list[PanoramaSe
     """A pair for each panorama of the tours of a folder that has others in its part; the rest are named."""
     from pansplat.tours.graph import find_tours
     from pansplat.tours.overlap import connect
+    from pansplat.tours.scene_views import leave_out
 
     tours = find_tours(pairs)
     if not tours:
@@ -122,7 +123,7 @@ def _leave_out_each(path: Path, pairs: Sequence[PanoramaSet]) -> list[PanoramaSe
         if alone:
             names = ", ".join(tour.panoramas[n].name for n in alone)
             print(f"note: {path}: not left out, because no other panorama shows the same: {names}", file=sys.stderr)
-        found += [tour.leave_out(n) for n in range(len(tour)) if n not in alone]
+        found += [leave_out(tour, n) for n in range(len(tour)) if n not in alone]
     return found
 
 

@@ -156,19 +156,18 @@ class Render(Computation):
     def _pose_between_cameras(self, scene: Scene) -> Tensor:
         import torch
 
-        from pansplat.tours.route import plan_visits
+        from pansplat.export.film import plan_visits
 
         fraction = 0.5 if self.at is None else self.at
-        return torch.from_numpy(plan_visits(scene).pose(fraction)) if scene.overlaps else scene.pose_between(fraction)
+        return torch.from_numpy(plan_visits(scene).pose(fraction)) if scene.tour else scene.pose_between(fraction)
 
     def _list_shots(self, scene: Scene, path: CameraPath | None) -> list[Shot]:
         """The frames of a film: of a path, or of the flight through all input cameras."""
-        from pansplat.export.film import follow_path, list_flight
-        from pansplat.tours.graph import make_graph
-        from pansplat.tours.route import plan_visits
+        from pansplat.export.film import follow_path, list_flight, plan_visits
+        from pansplat.tours.merge import make_graph
 
         if path is not None:
-            return follow_path(path, self.fps, scene, make_graph(scene) if scene.overlaps else None)
+            return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
         return list_flight(plan_visits(scene), self.fps, self.fov, self.seconds)
@@ -185,7 +184,7 @@ class Render(Computation):
         from pansplat.tours.route import NEAR_OF_FAR
 
         is_perspective = options["layout"] == "pinhole"
-        near = NEAR_OF_FAR * scene.far if scene.overlaps else NEAR
+        near = NEAR_OF_FAR * scene.far if scene.tour else NEAR
 
         @functools.lru_cache(maxsize=2)
         def renderer(shown: Scene) -> Callable[..., Rendering]:

@@ -70,7 +70,7 @@ class PoseCheck:
     """The result of a pose check.
 
     Attributes:
-        name: of the pair.
+        name: the pair's.
         baseline: largest distance between context cameras, metres.
         error: photometric error of the warp with the poses as given: 0 for a perfect fit, about 1 for unrelated images.
         errors: the error for each interpretation of the poses, best first; `AS_GIVEN` is one.

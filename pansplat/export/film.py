@@ -26,8 +26,13 @@ from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
-from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
-from pansplat.tours.route import STOP_REACH, Moment, Route, find_offset
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.limits import follow_edge
+from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.route import REST_SECONDS, STOP_REACH, Moment, Route, find_offset, plan_route
+from pansplat.tours.scene_views import choose_scene_views
+from pansplat.tours.walks import plan_walk
 
 _FADE_METRES = 0.2  # way along which a photograph fades beside a camera path: 0.2 s at a metre a second
 _HEIGHTS = (512, 1024, 2048, 4096)  # rows of photographs in memory; the least that is as dense as the frame is read
@@ -136,6 +141,16 @@ class Shot:
         return Shot(moment.pose, fov, seconds, moment, goal)
 
 
+def plan_visits(scene: Scene) -> Route:
+    """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
+    facts = TourFacts(scene)
+    outlooks = dict(enumerate(facts.outlooks))
+    if scene.tour is not None:
+        return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=outlooks)
+    tour = facts.tour.with_all_edges()
+    return plan_route(tour, range(len(tour)), rest=REST_SECONDS, outlooks=outlooks)
+
+
 def list_flight(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
     """The frames of a way through panoramas, two or more.
 
@@ -166,7 +181,7 @@ def follow_path(path: CameraPath, fps: float, scene: Scene, tour: TourGraph | No
 
 def choose_scenes(scene: Scene) -> Callable[[Shot], tuple[Scene, int]]:
     """What the frames of a film show of a scene, and its part: all, or of a tour the scene of the camera's edge."""
-    if not scene.overlaps:
+    if scene.tour is None:
         return lambda shot: (scene, 0)
     tour, edge = make_graph(scene), None
     select = functools.lru_cache(maxsize=4)(functools.partial(select_views, scene))
@@ -174,10 +189,10 @@ def choose_scenes(scene: Scene) -> Callable[[Shot], tuple[Scene, int]]:
     def choose(shot: Shot) -> tuple[Scene, int]:
         nonlocal edge
         place = shot.pose[:3, 3]
-        followed = tour.find_nearest_edge(place)[0] if edge is None else tour.follow_edge(place, edge)
+        followed = tour.find_nearest_edge(place)[0] if edge is None else follow_edge(tour, place, edge)
         edge = shot.edge or followed
         part = tour.parts[edge[0]]
-        return select(tour.list_parts()[part] if scene.joint else tour.choose_scene_views()[edge]), part
+        return select(tour.list_parts()[part] if scene.joint else choose_scene_views(tour)[edge]), part
 
     return choose
 

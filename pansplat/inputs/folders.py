@@ -54,7 +54,7 @@ def load_sets(
         path: see `load_collections`.
         convention: pose convention, such as "world2cam opencv"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
-        camera_height: of the cameras over the floor, metres.
+        camera_height: height of the cameras over the floor, metres.
 
     Raises:
         InputError: the folder or web tour holds two or more panoramas, and no poses.

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -62,9 +63,9 @@ class Note:
     """Information at a direction in a panorama, as a tour states it.
 
     Attributes:
-        yaw, pitch: as of a link, radians.
+        yaw, pitch: its direction, as that of a link, radians.
         text: plain text of one or more lines.
-        addresses: of web pages, http or https.
+        addresses: web pages, http or https.
     """
 
     yaw: float
@@ -234,7 +235,7 @@ class Collection:
 
     Attributes:
         source: file or folder that error messages name.
-        folder: of the files.
+        folder: the folder of the files.
         panoramas: in file order; none if no poses are known.
         groups: given context and target views; None to pair neighbours.
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
@@ -348,19 +349,11 @@ class Collection:
         if self.ordered or count == 2:
             return list(itertools.pairwise(members))
         centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
-        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)  # Prim's algorithm; in a grid many are equal
-        parent = torch.zeros(count, dtype=torch.long)
-        outside = torch.ones(count, dtype=torch.bool)
-        outside[0] = False
-        edges = []
-        while outside.any():
-            new = int(torch.where(outside, distance, torch.inf).argmin())
-            edges.append(tuple(sorted((members[int(parent[new])], members[new]))))
-            outside[new] = False
-            distance_to_new = (centres - centres[new]).norm(dim=-1).round(decimals=6)
-            parent[distance_to_new < distance] = new
-            distance = torch.minimum(distance, distance_to_new)
-        return sorted(edges)
+        distances = (centres[:, None] - centres).norm(dim=-1).round(decimals=6)
+        # Of equal distances, as in a grid, the first ones are taken on every processor. A weight of 0 is no edge.
+        weights = distances.unique(return_inverse=True)[1] * count**2 + torch.arange(1, count**2 + 1).view(count, count)
+        tree = scipy.sparse.csgraph.minimum_spanning_tree(weights.triu(1).double().numpy())
+        return sorted(tuple(sorted((members[a], members[b]))) for a, b in zip(*tree.nonzero(), strict=True))
 
 
 def localize_sets(pairs: Sequence[PanoramaSet], camera_height: float = CAMERA_HEIGHT) -> list[PanoramaSet]:
@@ -396,10 +389,10 @@ def single_view_sets(
     """A pair of one view for each panorama.
 
     Args:
-        folder: of the tour; predictions are cached there.
+        folder: the tour's; predictions are cached there.
         near, far: metres; None for the range of rooms.
         siblings: panoramas of the same camera, by default the same ones.
-        first_world: of the first panorama; each has a world of its own.
+        first_world: the world of the first panorama; each has a world of its own.
     """
     near, far = NEAR if near is None else near, FAR if far is None else far
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')

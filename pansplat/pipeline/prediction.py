@@ -34,7 +34,8 @@ from pansplat.system.devices import choose_device, note_full_card, with_device
 from pansplat.system.files import find_scene_suffix
 from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
 from pansplat.system.progress import POSED, report_progress, stage
-from pansplat.tours.graph import find_tours, list_starts
+from pansplat.tours.graph import find_tours
+from pansplat.tours.merge import list_starts
 
 _DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
 _MAX_CACHED_HEIGHT = 512  # rows of a network's prediction that is cached; taller ones are written tile by tile

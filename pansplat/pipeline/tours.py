@@ -23,8 +23,10 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import with_device
 from pansplat.system.options import MIN_HEIGHT
 from pansplat.system.progress import CONNECTED, POSED, stage
-from pansplat.tours.graph import MAX_SCENE_VIEWS, TourGraph, find_tours, merge_scenes, select_views
+from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.tours.merge import merge_scenes, select_views
 from pansplat.tours.overlap import connect
+from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_scene_views, choose_sources
 
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 _GAUSSIANS_PER_SQUARE = 0.75  # Gaussians of a panorama over the square of its rows; about those of the default model
@@ -59,7 +61,7 @@ def predict_tour(
             tour = _load_only_tour(tour)
     warn_of_single_views(tour, predictor)
     max_views, is_refined = find_max_views(predictor), options.joint and options.refine_steps != 0
-    total = len(tour.choose_sources(max_views))
+    total = len(choose_sources(tour, max_views))
     part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # limit of Gaussians of a panorama
     counter = itertools.count(1)
     each = replace(options, joint=False, refine_steps=0) if options.joint else options
@@ -106,7 +108,7 @@ def choose_predictor(pair: PanoramaSet, predictor: Predictor) -> Predictor:
 
 def warn_of_single_views(tour: TourGraph, predictor: Predictor) -> None:
     """Warn if `choose_predictor` replaces the predictor in some scenes of a tour."""
-    count = sum(len(views) == 1 for views in set(tour.choose_scene_views().values()))
+    count = sum(len(views) == 1 for views in set(choose_scene_views(tour).values()))
     if count and find_min_views(predictor) > 1:
         warnings.warn(
             f"{tour.name}: {count} single view{'s are' if count > 1 else ' is'} predicted by default, because "

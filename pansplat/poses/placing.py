@@ -27,7 +27,7 @@ from pansplat.poses.axes import SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import estimate_depth
 from pansplat.tours.floor import find_ceiling, trace_floor
-from pansplat.tours.graph import turn_plan
+from pansplat.tours.linked_rooms import turn_plan
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _IMAGE_HEIGHT = 1024  # largest one, in which edges are looked for

@@ -35,7 +35,7 @@ class Sweep:
     """
 
     max_views = MAX_CONTEXT
-    """Of one prediction; each view is matched against a few others, so that time grows linearly with their number."""
+    """Largest number of views of a prediction, whose time grows linearly: a view is matched against a few others."""
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
 

@@ -31,7 +31,7 @@ class RoomTriplets:
     """A `SampleSource` of rooms.
 
     Attributes:
-        seed: of the rooms.
+        seed: seed of the random rooms.
         count: samples per epoch; larger indices are valid too.
     """
 

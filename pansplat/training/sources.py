@@ -22,14 +22,7 @@ from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
 from pansplat.training.config import DataConfig
 from pansplat.training.room import RoomTriplets
-from pansplat.training.sequences import (
-    BoundedSampler,
-    FramePair,
-    ImageSequence,
-    Stage,
-    read_frame_pair,
-    read_loc360,
-)
+from pansplat.training.sequences import BoundedSampler, FramePair, Stage, read_frame_pair, read_loc360
 
 _VALIDATION_SEED_OFFSET = 1_000_003  # added to the seed, so that rooms differ from those of training
 _VALIDATION_DRAWS = 4  # frame pairs per sequence
@@ -97,7 +90,7 @@ def _read_pair(pair: PanoramaSet, height: int, seed: int) -> Sample:
 class RandomFramePairs:
     """Random frame pairs for training; `draws` per sequence make an epoch."""
 
-    sequences: Sequence[ImageSequence]
+    sequences: Sequence[PanoramaSet]
     sampler: BoundedSampler
     draws: int = 1000
 
@@ -106,7 +99,7 @@ class RandomFramePairs:
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
         sequence = self.sequences[index // self.draws]
-        pair = self.sampler.training(len(sequence.poses), np.random.default_rng((seed, index)))
+        pair = self.sampler.training(len(sequence.targets), np.random.default_rng((seed, index)))
         return read_frame_pair(sequence, pair, height)
 
 
@@ -118,8 +111,8 @@ class FixedFramePairs:
         choose: from a number of frames to frame pairs, such as `BoundedSampler().evaluation`.
     """
 
-    def __init__(self, sequences: Sequence[ImageSequence], choose: Callable[[int], Sequence[FramePair]]) -> None:
-        self.pairs = [(sequence, pair) for sequence in sequences for pair in choose(len(sequence.poses))]
+    def __init__(self, sequences: Sequence[PanoramaSet], choose: Callable[[int], Sequence[FramePair]]) -> None:
+        self.pairs = [(sequence, pair) for sequence in sequences for pair in choose(len(sequence.targets))]
 
     def __len__(self) -> int:
         return len(self.pairs)

@@ -159,20 +159,3 @@ def test_a_single_view_is_refused() -> None:
 def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:
     check = check_pair(load_sets(shared / "data" / data)[index])
     assert check.likely_mistake is None
-
-
-@pytest.mark.slow
-@pytest.mark.shared
-@pytest.mark.parametrize(
-    ("convention", "interpretation"),
-    [
-        ("cam2world opengl", "opengl axes"),
-        ("world2cam opencv", "inverse"),
-        ("world2cam opengl", "inverse"),  # with OpenCV axes: both words of the convention are wrong
-    ],
-)
-def test_a_real_pair_with_the_wrong_convention_is_detected(shared: Path, convention: str, interpretation: str) -> None:
-    check = check_pair(load_sets(shared / "data" / "zind", convention=convention)[3])
-    assert _best(check) == interpretation
-    assert check.likely_mistake is not None
-    assert check.likely_mistake.startswith(_ADVICE[interpretation])

@@ -93,7 +93,7 @@ def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(
 ) -> None:
     pairs = [load_sets(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
     cases = evaluate(pairs, sphere_predictor(), tmp_path / "out", height=HEIGHT)
-    assert [case.get("name") for case in cases] == ["room", "room-2"]
+    assert [case.get("name") for case in cases] == ["room", "room_2"]
     assert len({case.get("prediction") for case in cases}) == 2
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(results_table(cases))

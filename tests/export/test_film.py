@@ -10,13 +10,12 @@ import pytest
 import torch
 from synthetic_scenes import make_balls
 
-from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, write_film
+from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.rendering.image_planes import image_planes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
-from pansplat.tours.route import plan_visits
 
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 POSES[1, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right

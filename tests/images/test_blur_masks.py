@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from panorama_formats import EXAMPLES, write_posed, write_room
 from PIL import Image
 from refusals import expect_error
 
@@ -16,15 +17,11 @@ from pansplat import pipeline
 from pansplat.cli.pose import Pose
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.training_set import write_dataset
-from pansplat.geometry.cubemap import face_poses
 from pansplat.images.blur_masks import blur_hidden, find_blur_mask, resize_hidden, widen_hidden
 from pansplat.images.image_files import read_blur_mask, read_panorama, read_thumbnail, write_image
-from pansplat.images.rig_images import Lens
 from pansplat.inputs.content import hash_context, hash_panorama
 from pansplat.inputs.folders import load_panoramas, load_sets
-from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
-from pansplat.inputs.reconstructions.colmap import write_colmap
-from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.poses.files import _hash_inputs
 from pansplat.system.store import hash_parts
 from pansplat.training.sequences import LOCATIONS, read_loc360
@@ -47,18 +44,15 @@ def _write(path: Path, person: int, mask: np.ndarray | None = HIDDEN) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(_make_photograph(person)).save(path)
     if mask is not None:
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name(f"{path.stem}_blur.png"))
+        _draw_mask(path.with_name(f"{path.stem}_blur.png"), mask)
     return path
 
 
 def _write_pair(folder: Path, person: int) -> Path:
-    poses = {}
-    for number, name in enumerate(("left.png", "right.png")):
-        _write(folder / name, person + number)
-        pose = np.eye(4)
-        pose[0, 3] = 0.5 * number
-        poses[name] = {"cam2world": pose.tolist()}
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    pictures = {f"{name}.png": _make_photograph(person + n) for n, name in enumerate(("left", "right"))}
+    write_posed(folder, pictures, (0, 0.5))
+    for name in ("left", "right"):
+        _draw_mask(folder / f"{name}_blur.png")
     return folder
 
 
@@ -125,7 +119,7 @@ def test_every_read_of_a_photograph_is_blurred(tmp_path: Path, suffix: str) -> N
             Image.fromarray(_make_photograph(person)).save(path, quality=90)
         else:
             write_image(path, _make_photograph(person))
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name("a_blur.png"))
+        _draw_mask(path.with_name("a_blur.png"), mask)
         image, opaque = read_panorama(path, HEIGHT)
         assert opaque.all()
         reads.append((image, read_panorama(path, 32)[0], read_thumbnail(path, 16)))
@@ -146,7 +140,7 @@ def test_cube_faces_of_a_panorama_are_blurred(tmp_path: Path, color_face: Callab
     (pair,) = load_sets(tmp_path)
     plain = pair.load_context(HEIGHT)
     assert pair.context[0].name == "hall" and find_blur_mask(pair.context[0].image) is None
-    Image.fromarray(np.where(HIDDEN, 255, 0).astype(np.uint8)).save(tmp_path / "hall_blur.png")
+    _draw_mask(tmp_path / "hall_blur.png")
     (pair,) = load_sets(tmp_path)
     assert find_blur_mask(pair.context[0].image) == tmp_path / "hall_blur.png"
     views = pair.load_context(HEIGHT)
@@ -266,134 +260,68 @@ def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
     expect_error(r"frame_1_blur\.png: .*frame_0_blur", read_loc360, tmp_path, "val")
 
 
-SIDE = 48  # pixels along a face
-COVER = np.zeros((SIDE, SIDE), bool)  # what a mask of the front face covers
-COVER[16:36, 14:34] = True
-FRONT = np.zeros((HEIGHT, 2 * HEIGHT), bool)  # the front face, and more
-FRONT[10:54, 44:84] = True
-FACES = {"f": "front", "r": "right", "b": "back", "l": "left", "u": "up", "d": "down"}
-
-
-def _write_faces(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    """Six faces of hall; another person for each number is on the front face, where `COVER` is white."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for face in FACES:
-        pixels = color_face(face, SIDE)
-        if face == "f":
-            pixels[COVER] = np.random.default_rng(person).integers(0, 255, (int(COVER.sum()), 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"hall_{face}.png")
-    return folder
-
-
-def _write_set(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    """The faces with poses, as COLMAP and nerfstudio have them, in two places."""
-    (folder / "images").mkdir(parents=True)
-    lens = Lens(SIDE / 2, SIDE / 2, SIDE / 2, SIDE / 2, SIDE, SIDE)
-    rigs = []
-    for place in (0, 1):
-        _write_faces(folder / "faces", color_face, person if place == 0 else 0)
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[0, 3] = place
-        rig = []
-        for face, turned in zip(FACES, face_poses(pose), strict=True):
-            name = f"000{place}_a_{FACES[face]}.png"
-            (folder / "faces" / f"hall_{face}.png").rename(folder / "images" / name)
-            rig.append((name, turned, lens))
-        rigs.append(rig)
-    (folder / "faces").rmdir()
-    (folder / "sparse" / "0").mkdir(parents=True)
-    write_colmap(folder / "sparse" / "0", rigs, np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    shots = [(f"images/{name}", pose, shot_lens, None) for rig in rigs for name, pose, shot_lens in rig]
-    write_nerfstudio(folder / "transforms.json", shots, None)
+def _write_example(folder: Path, name: str) -> Path:
+    """Two panoramas, hall and room, of cube faces or of perspective pictures of 8 x 8 pixels."""
+    EXAMPLES[name].state(write_room(folder, NAMES), NAMES)
     (folder / "scale.txt").write_text("1\n")
     return folder
 
 
-def _write_colmap(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    (_write_set(folder, color_face, person) / "transforms.json").unlink()
-    return folder
+NAMES = "hall.png", "room.png"
+COVER = np.ones((8, 8), bool)  # what a mask of a picture covers
 
 
-ASSEMBLED = {
-    "faces": (_write_faces, "hall_f_blur.png"),
-    "nerfstudio": (_write_set, "images/0000_a_front_blur.png"),
-    "colmap": (_write_colmap, "images/0000_A_front_BLUR.png"),
-}
-
-
-def _load_first(folder: Path) -> Panorama:
-    return load_sets(folder)[0].context[0]
-
-
-@pytest.mark.parametrize("kind", ASSEMBLED)
+@pytest.mark.parametrize(("kind", "name"), [("cube faces", "hall_f_blur.png"), ("rigs", "faces/Hall_0_BLUR.png")])
 def test_a_blur_mask_of_a_picture_is_refused_and_the_mask_of_its_panorama_is_named(
-    tmp_path: Path, kind: str, color_face: Callable[[str, int], np.ndarray]
+    tmp_path: Path, kind: str, name: str
 ) -> None:
-    write, name = ASSEMBLED[kind]
-    folder = write(tmp_path / "set", color_face, 1)
+    folder = _write_example(tmp_path / "set", kind)
     mask = _draw_mask(folder / name, COVER)
-    expect_error(rf"{mask.name}: needed .*(hall|0000_a)_blur", load_sets, folder)
+    expect_error(rf"{mask.name}: .*[/ ]hall_blur", load_panoramas, folder)
     mask.unlink()
-    _draw_mask(folder / f"{load_panoramas(folder)[0].name}_blur.png")
-    assert find_blur_mask(_load_first(folder).image)
+    _draw_mask(folder / "hall_Blur.PNG")
+    _draw_mask(folder / "hall_mask.png", kind="mask")
+    panorama = load_panoramas(folder)[0]
+    assert find_blur_mask(panorama.image) == folder / "hall_Blur.PNG" and panorama.mask == folder / "hall_mask.png"
 
 
 @pytest.mark.filterwarnings("ignore:.*in no picture")
-def test_a_scene_mask_beside_a_perspective_picture_masks_it_and_that_of_a_cube_face_is_refused(
-    tmp_path: Path, color_face: Callable[[str, int], np.ndarray]
-) -> None:
-    folder = _write_set(tmp_path / "set", color_face, 1)
-    _draw_mask(folder / "images" / "0000_a_Front_mask.png", COVER, kind="mask")
+@pytest.mark.parametrize(
+    "name", ["faces/Hall_0_mask.png", "masks/faces/hall_0.png.png", "masks/Hall_0.PNG.png", "masks/hall_0.png"]
+)
+def test_a_scene_mask_of_a_perspective_picture_masks_it(tmp_path: Path, name: str) -> None:
+    folder = _write_example(tmp_path / "set", "rigs")
+    _draw_mask(folder / name, COVER, kind="mask")
     masks = load_sets(folder)[0].load_context(64).masks
-    assert not masks[0, 34, 64] and masks[0, :, :32].all() and masks[1].all()
-    folder = _write_faces(tmp_path / "faces", color_face, 1)
+    assert not masks[0, 32, 64] and masks[0, :, :32].all() and masks[1].all(), "the first picture is ahead"
+
+
+def test_a_scene_mask_of_a_cube_face_is_refused(tmp_path: Path) -> None:
+    folder = _write_example(tmp_path / "faces", "cube faces")
     _draw_mask(folder / "hall_f_mask.png", COVER, kind="mask")
-    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_sets, folder)
+    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_panoramas, folder)
 
 
 @pytest.mark.parametrize(
     ("kind", "name", "got"),
     [
-        ("faces", "hall_blur.png", "192x96, got 48x48"),
-        ("colmap", "images/0000_a_blur.png", "set/0000_a_blur"),
-        ("nerfstudio", "images/0000_a_frond_blur.png", "/0000_a_blur"),
-        ("colmap", "masks/0000_a_frond.png.png", "the name of a picture"),
-        ("nerfstudio", "masks/0000_a_front_blur.png", "the name"),
+        ("cube faces", "hall_blur.png", "32x16, got 8x8"),
+        ("rigs", "faces/hall_blur.png", "set/hall_blur"),
+        ("rigs", "masks/hall_9.png.png", "the name of a picture"),
+        ("rigs", "masks/hall_0_blur.png", "the name"),
     ],
 )
-def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(
-    tmp_path: Path, kind: str, name: str, got: str, color_face: Callable
-) -> None:
-    mask = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1) / name
-    mask.parent.mkdir(exist_ok=True)
-    Image.new("L", (48, 48)).save(mask)
-    expect_error(f"{mask.name}: needed.*{got}", load_sets, tmp_path / "set")
+def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(tmp_path: Path, kind: str, name: str, got: str) -> None:
+    mask = _draw_mask(_write_example(tmp_path / "set", kind) / name, COVER)
+    expect_error(f"{mask.name}: needed.*{got}", load_panoramas, tmp_path / "set")
 
 
-@pytest.mark.parametrize("name", ["0000_a_front.png.png", "0000_A_front.PNG.png", "0000_a_front.png"])
-@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
-def test_the_folder_masks_is_applied(tmp_path: Path, kind: str, name: str, color_face: Callable) -> None:
-    folder = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1)
-    _draw_mask(folder / "masks" / name, COVER, kind="mask")
-    with pytest.warns(InputWarning, match="in no picture"):
-        assert not load_sets(folder)[0].load_context(64).masks[0, 34, 64]
-
-
-def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path, color_face: Callable) -> None:
-    file = _write_set(tmp_path / "set", color_face, 1) / "transforms.json"
+def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path) -> None:
+    file = _write_example(tmp_path / "set", "rigs") / "transforms.json"
     content = json.loads(file.read_text())
     content["frames"][3]["mask_path"] = "masks/a.png"
     file.write_text(json.dumps(content))
-    expect_error(r"frame 3: .*masks/a\.png", load_sets, file.parent)
-
-
-def test_a_mask_beside_a_rig_is_that_of_its_panorama(tmp_path: Path, color_face: Callable) -> None:
-    folder = _write_set(tmp_path / "set", color_face, 1)
-    _draw_mask(folder / "0000_a_mask.png", kind="mask")
-    _draw_mask(folder / "0001_A_Blur.PNG")
-    panoramas = load_sets(folder)[0].context
-    assert panoramas[0].mask == folder / "0000_a_mask.png" and panoramas[1].mask is None
-    assert find_blur_mask(panoramas[1].image) == folder / "0001_A_Blur.PNG"
+    expect_error(r"frame 3: .*masks/a\.png", load_panoramas, file.parent)
 
 
 def _link(path: Path, target: Path) -> None:
@@ -408,7 +336,7 @@ def test_masks_beside_a_link_are_applied_and_those_beside_its_file_are_refused(t
     (tmp_path / "store").mkdir()
     moved = (folder / "left.png").rename(tmp_path / "store" / "left.png")
     _link(folder / "left.png", moved)
-    assert find_blur_mask(_load_first(folder).image) == folder / "left_blur.png"
+    assert find_blur_mask(load_panoramas(folder)[0].image) == folder / "left_blur.png"
     (folder / "left_blur.png").rename(tmp_path / "store" / "left_blur.png")
     expect_error(r"store/left_blur\.png: needed", load_sets, folder)
 
@@ -419,45 +347,34 @@ def test_a_name_has_its_mask_in_both_forms_of_unicode(tmp_path: Path, forms: tup
     picture, name = (unicodedata.normalize(form, "K\u00fcche") for form in forms)  # type: ignore[arg-type]
     _write(tmp_path / f"{picture}.png", 1, None)
     mask = _draw_mask(tmp_path / f"{name}_blur.png")
-    found = find_blur_mask(_load_first(tmp_path).image)
+    found = find_blur_mask(load_panoramas(tmp_path)[0].image)
     assert found is not None and found.samefile(mask)
 
 
-@pytest.mark.parametrize(("kind", "name"), [("panoramas", "left_blur.png"), ("set", "0000_a_blur.png")])
 def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
-    tmp_path: Path, kind: str, name: str, color_face: Callable, sphere_predictor: Callable[[], object]
+    tmp_path: Path, sphere_predictor: Callable[[], object]
 ) -> None:
     def list_keys(pair: PanoramaSet) -> tuple[str, ...]:
         """Those of predictions, of estimated poses, and of pages."""
         return hash_context(pair), _hash_inputs(pair.context, 1.5), hash_parts(*map(hash_panorama, pair.context))
 
-    scenes, sets, predictor = [], [], sphere_predictor()
+    scenes, sets, predictor, nothing = [], [], sphere_predictor(), np.zeros((1, 3))
     for person in (1, 5):
-        folder = tmp_path / f"{person}"
-        if kind == "set":
-            mask = _draw_mask(_write_set(folder, color_face, person) / name, FRONT)
-        else:
-            mask = _write_pair(folder, person) / name
-        before = mask.rename(tmp_path / "mask.png")
-        keys = []
+        folder, new = tmp_path / f"{person}", tmp_path / f"new{person}"
+        mask = _write_pair(folder, person) / "left_blur.png"
+        before, keys = mask.rename(tmp_path / "mask.png"), []
         for _ in range(2):
             (pair,) = load_sets(folder)
             scenes.append(pipeline.predict(pair, predictor, height=HEIGHT).gaussians)  # type: ignore[arg-type]
-            keys.append((*list_keys(pair), predictor.calls))  # type: ignore[attr-defined]
+            keys.append(list_keys(pair))
             if not mask.exists():
                 before.rename(mask)
-        pipeline.predict(pair, predictor, height=HEIGHT)  # type: ignore[arg-type]
-        assert predictor.calls == keys[-1][-1], "read from the cache"  # type: ignore[attr-defined]
-        stated = mask.read_bytes()
-        _draw_mask(mask, np.roll(FRONT if kind == "set" else HIDDEN, 4, axis=0))
-        keys.append((*list_keys(pair), -1))
-        assert all(len(set(values)) == 3 for values in zip(*keys, strict=True)), "without, with, and with another mask"
-        mask.write_bytes(stated)
-        new = tmp_path / f"new{person}"
         new.mkdir()
-        nothing = np.zeros((1, 3))
         write_dataset(new, pair.context, pair.siblings, nothing, nothing.astype(np.uint8))
         sets.append({file.name: file.read_bytes() for file in new.rglob("*.*")})
+        _draw_mask(mask, np.roll(HIDDEN, 4, axis=0))
+        keys.append(list_keys(pair))
+        assert all(len(set(values)) == 3 for values in zip(*keys, strict=True)), "without, with, and with another mask"
     plain, first, _, second = scenes
     assert torch.equal(first.harmonics, second.harmonics) and torch.equal(first.means, second.means)
     assert not torch.equal(plain.harmonics, first.harmonics)
@@ -472,4 +389,4 @@ def test_a_web_tour_names_the_picture_of_its_masks(tmp_path: Path) -> None:
     _draw_mask(tmp_path / "kitchen_blur.png")
     expect_error(r"kitchen_blur\.png: .*IMG_1_blur\.png", load_sets, tmp_path)
     (tmp_path / "kitchen_blur.png").rename(tmp_path / "panos" / "IMG_1_Blur.PNG")
-    assert find_blur_mask(_load_first(tmp_path).image) == tmp_path / "panos" / "IMG_1_Blur.PNG"
+    assert find_blur_mask(load_panoramas(tmp_path)[0].image) == tmp_path / "panos" / "IMG_1_Blur.PNG"

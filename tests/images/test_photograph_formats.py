@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 from numpy import ndarray as Array
+from panorama_formats import write_posed
 from PIL import Image
 from refusals import expect_error
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.images.image_files import read_panorama, read_size, read_thumbnail, write_image
+from pansplat.images.image_files import read_panorama, read_size, read_thumbnail
 from pansplat.inputs.folders import load_sets
 
 SIZE = 64
@@ -65,6 +66,7 @@ def test_tiff_of_floating_point_numbers_is_refused(tmp_path: Path) -> None:
     expect_error(r"a\.tif: needed", read_panorama, tmp_path / "a.tif", 16)
 
 
+KINDS = "jpg", "png", "tif", "webp"  # Pillow turns these
 ORIENT: dict[int, Callable[[Array], Array]] = {  # how a picture is stored for each EXIF orientation
     1: lambda a: a,
     3: lambda a: np.rot90(a, 2),
@@ -75,9 +77,11 @@ ORIENT: dict[int, Callable[[Array], Array]] = {  # how a picture is stored for e
 }
 
 
-@pytest.mark.parametrize("orientation", ORIENT)
-@pytest.mark.parametrize("name", ["a.jpg", "a.png", "deep.png", "a.tif", "deep.tif", "a.webp"])
-def test_exif_orientation_is_applied(tmp_path: Path, pixels: Array, orientation: int, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "orientation"),
+    [*((f"deep.{kind}", each) for kind in ("png", "tif") for each in ORIENT), *((f"a.{k}", 6) for k in KINDS)],
+)
+def test_exif_orientation_is_applied(tmp_path: Path, pixels: Array, name: str, orientation: int) -> None:
     stored = np.ascontiguousarray(ORIENT[orientation](pixels))
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -194,32 +198,20 @@ def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:
         load_sets(tmp_path)
 
 
-def _posed(folder: Path, heights: dict[str, int], **entries: object) -> Path:
-    folder.mkdir()
-    poses: dict[str, object] = {}
-    for number, (name, height) in enumerate(heights.items()):
-        write_image(folder / name, torch.rand(3, height, 2 * height))
-        pose = np.eye(4)
-        pose[0, 3] = number
-        poses[name] = {"cam2world": pose.tolist()}
-    poses |= entries
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    return folder
-
-
 def test_panoramas_of_different_sizes_are_one_pair(tmp_path: Path) -> None:
-    (pair,) = load_sets(_posed(tmp_path / "room", {"a.png": 48, "b.jpg": 32}))
+    (pair,) = load_sets(write_posed(tmp_path / "room", {"a.png": _pixels(48), "b.jpg": _pixels(32)}, (0, 1)))
     assert pair.image_height == 32
     assert pair.load_context(32).images.shape == (2, 3, 32, 64)
 
 
 def test_a_pose_without_its_picture_and_a_missing_depth_are_notes(tmp_path: Path) -> None:
-    folder = _posed(tmp_path / "room", {"a.png": 32, "b.png": 32}, gone={"cam2world": np.eye(4).tolist()})
-    with pytest.warns(InputWarning, match=r"left out: .*poses\.json: needed the image .*gone, got no such file"):
+    folder = write_posed(tmp_path / "room", {f"{name}.png": _pixels(32) for name in ("a", "b", "gone")}, (0, 1, 2))
+    (folder / "gone.png").unlink()
+    with pytest.warns(InputWarning, match=r"left out: .*poses\.json: needed the image .*gone\.png, got no such file"):
         (pair,) = load_sets(folder)
     assert [view.name for view in pair.context] == ["a", "b"]
     content = json.loads((folder / "poses.json").read_text())
-    del content["poses"]["gone"]
+    del content["poses"]["gone.png"]
     content["poses"]["a.png"]["depth"] = "depth/a.exr"
     (folder / "poses.json").write_text(json.dumps(content))
     with pytest.warns(InputWarning, match=r"'a\.png': its depth is left out: there is no file .*a\.exr"):

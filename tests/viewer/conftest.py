@@ -25,8 +25,10 @@ from pansplat.inputs.panorama_sets import Link, Panorama, PanoramaSet
 from pansplat.rendering import Rendering, rasterize
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
-from pansplat.tours.graph import TourGraph, merge_scenes
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.merge import merge_scenes
 from pansplat.tours.outlook import BINS
+from pansplat.tours.scene_views import choose_scene_views
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
@@ -297,7 +299,7 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     tour = entry.tour
     assert tour is not None
     if not entry.views:
-        views = next(iter(tour.choose_scene_views().values()))
+        views = next(iter(choose_scene_views(tour).values()))
         entry = SceneEntry(entry.name, pair=tour.make_set(views), tour=tour, views=views)
     directions, cam2world = fibonacci_directions(500), tour.cam2world[list(entry.views)]
     color = torch.tensor((0.3, 0.5, 0.7)).roll(sum(entry.views)) + 0.2 * directions
@@ -309,7 +311,7 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     angles = torch.linspace(0, 2 * torch.pi, 13)[:-1]
     corners = torch.stack((angles.sin(), angles.cos()), dim=1).double().numpy()
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
-    outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
+    outlines = {view: FloorOutline(center + corners, 1.0) for view, center in centers.items()}
     facts = TourFacts(scene, tour, entry.views)
     outlooks = np.zeros((len(entry.views), BINS))
     vars(facts).update(

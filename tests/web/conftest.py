@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 
@@ -65,7 +65,7 @@ def plain_scene() -> Scene:
 @pytest.fixture(scope="session")
 def house(scene: Scene) -> Scene:
     """The scene as that of a tour: the three views in a row, two edges."""
-    return dataclasses.replace(scene, overlaps=((0, 1, 0.5), (1, 2, 0.4)))
+    return dataclasses.replace(scene, tour=SceneTour(((0, 1, 0.5), (1, 2, 0.4))))
 
 
 @pytest.fixture(scope="session")
@@ -84,8 +84,10 @@ def flat() -> Scene:
         gaussians=dataclasses.replace(scene.gaussians, means=means),
         cam2world=poses,
         names=("room 0", "room 1", "</script><b>hall", "attic"),
-        overlaps=((0, 1, 0.5), (2, 2, 1.0), (3, 3, 1.0)),
-        links=((0, 2, 0.5 * math.pi, 0.6, "<i>down"), (2, 0, 0.0, 0.3, "")),
+        tour=SceneTour(
+            ((0, 1, 0.5), (2, 2, 1.0), (3, 3, 1.0)),
+            ((0, 2, 0.5 * math.pi, 0.6, "<i>down"), (2, 0, 0.0, 0.3, "")),
+        ),
         starts=((0.3, 0.2), None, None, (1.0, -0.2)),
     )
 

@@ -12,8 +12,11 @@ from pansplat.geometry.path import (
     level_axes,
 )
 from pansplat.tours.camera_path import CameraPath, KeyFrame
-from pansplat.tours.graph import TourGraph, make_graph
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.limits import limit_step
+from pansplat.tours.merge import make_graph
 from pansplat.tours.route import NEAR_OF_FAR, Moment, Route, plan_route
+from pansplat.tours.walks import plan_walk
 from pansplat_viewer.core.camera import Camera, move_to_pose
 from pansplat_viewer.core.picking import PickedPoint
 from pansplat_viewer.core.settings import Display, DrawSettings
@@ -104,7 +107,7 @@ def enter_scene(state: ViewerState, scene: Scene, tour: TourGraph | None = None,
     if graph is None:
         level, pose = level_axes(scene.cam2world), _choose_outside_pose(scene)
     else:
-        walk = range(len(graph)) if tour is None else graph.plan_walk(start)
+        walk = range(len(graph)) if tour is None else plan_walk(graph, start)
         state.route, level = plan_route(graph, walk), graph.level_axes
         pose = state.route.pose(0.0)
     levelled = replace(state.camera, level=tuple(tuple(row) for row in level.tolist()))
@@ -152,7 +155,7 @@ def limit_camera(state: ViewerState, before: Camera) -> None:
     place = np.array(before.position)
     first, last = graph.find_nearest_edge(place)[0]
     if first != last or not state.is_tour:
-        place = graph.limit_step(place, np.array(camera.position))
+        place = limit_step(graph, place, np.array(camera.position))
     state.camera = replace(camera, position=tuple(place.tolist()))
     if not state.is_tour and not state.has_stopped and not np.allclose(place, camera.position):
         state.has_stopped = True
@@ -198,7 +201,8 @@ def add_key_frame(state: ViewerState) -> None:
 
 def make_key_frame(camera: Camera, seconds: float) -> KeyFrame:
     """The camera as a key frame."""
-    return KeyFrame.of_pose(camera.cam2world, seconds, camera.vertical_fov_degrees)
+    place, ahead = (tuple(camera.cam2world[:3, column].tolist()) for column in (3, 2))
+    return KeyFrame(seconds, place, ahead, camera.vertical_fov_degrees)
 
 
 def show_path(state: ViewerState, seconds: float) -> None:

@@ -16,9 +16,13 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
-from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
+from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
+from pansplat.tours.limits import EDGE_HYSTERESIS, follow_edge
 from pansplat.tours.links import link_parts
+from pansplat.tours.merge import select_views
 from pansplat.tours.route import Route, plan_route
+from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_predictions, choose_scene_views
+from pansplat.tours.walks import find_walk, find_way, plan_walk
 from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry
 
@@ -51,7 +55,7 @@ class TourScenes:
     """The scenes of one tour: chooses, requests and keeps them. It loads nothing itself.
 
     A scene is that of an edge. Its Gaussians are selected from predictions of whole parts
-    (`TourGraph.choose_predictions`); of a network it is a prediction of its own.
+    (`choose_predictions`); of a network it is a prediction of its own.
 
     Attributes:
         tour: the graph.
@@ -67,7 +71,7 @@ class TourScenes:
         Args:
             tour: the graph.
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
-            max_views: of the predictor (`TourGraph.choose_predictions`).
+            max_views: of the predictor (`choose_predictions`).
         """
         self.tour = tour
         self._graphs = [tour]  # also those before poor edges and walls were found, which pending entries have
@@ -76,11 +80,11 @@ class TourScenes:
         self.outlines: dict[int, FloorOutline] = {}
         self.outlooks: dict[int, np.ndarray] = {}
         self.hidden: dict[int, list[int]] = {}
-        self._views = tour.choose_scene_views()
+        self._views = choose_scene_views(tour)
         everything = tuple(range(len(tour)))
         # The prediction that has the Gaussians of a panorama; none if each scene is a prediction.
         self._providers = (
-            tour.choose_predictions(max_views) if merged is None else dict.fromkeys(everything, everything)
+            choose_predictions(tour, max_views) if merged is None else dict.fromkeys(everything, everything)
         )
         self._sources = {
             views: tuple(dict.fromkeys(self._providers.get(node, views) for node in views))
@@ -238,7 +242,7 @@ class TourScenes:
         """Choose an edge that is flown, or that of a camera position."""
         if edge is None or edge not in self._views:  # a wall was found while it was flown along
             tour, known = self.tour, self._is_edge_known
-            edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
+            edge = follow_edge(tour, position, self.edge) if known else tour.find_nearest_edge(position)[0]
         self.edge, self._is_edge_known = edge, True
 
     def find_nearest(self, position: Float[np.ndarray, "3"]) -> int:
@@ -269,7 +273,8 @@ class TourScenes:
         tour, here = self.tour, set(self.edge)
         middle = tour.positions[list(self.edge)].mean(axis=0)
         inside = [edge for edge in self._views if tour.parts[edge[0]] == self.part]
-        inside.sort(key=lambda edge: (not here & set(edge), tour.measure_distance(edge, middle), tour.length(edge)))
+        away = dict(zip(inside, tour.measure_distances(inside, middle), strict=True))
+        inside.sort(key=lambda edge: (not here & set(edge), away[edge], tour.length(edge)))
         linked = [end for start, end in tour.links if start in here]
         following = (node % len(tour) for node in range(self.edge[1] + 1, self.edge[1] + len(tour)))
         outside = [tour.find_edge(node) for node in (*linked, *following) if tour.parts[node] != self.part]
@@ -298,7 +303,7 @@ class TourScenes:
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], nodes: Sequence[int] = (), *, rest: float = 0.0) -> Route:
         """`plan_way` in the part of a camera, which may be that after a jump; it zooms along edges without a scene."""
-        part, loaded = self.tour.parts[self.tour.follow_edge(camera[:3, 3], self.edge)[0]], set(self.loaded)
+        part, loaded = self.tour.parts[follow_edge(self.tour, camera[:3, 3], self.edge)[0]], set(self.loaded)
         missing = [edge for edge, views in self._views.items() if views not in loaded]
         tour = replace(self.tour, poor=tuple({*self.tour.poor, *missing}))
         return plan_way(tour, camera, nodes, part=part, rest=rest, outlooks=self.outlooks)
@@ -332,12 +337,12 @@ def plan_way(
     """
     position = camera[:3, 3]
     if nodes:
-        walk = graph.find_way(position, nodes[0], part)
+        walk = find_way(graph, position, nodes[0], part)
         for a, b in itertools.pairwise(nodes):
-            walk += graph.find_walk(a, b)[1:]
+            walk += find_walk(graph, a, b)[1:]
     else:
         edge, _ = graph.find_nearest_edge(position, part)
-        walk = graph.plan_walk(min(edge, key=lambda node: float(np.linalg.norm(graph.positions[node] - position))))
+        walk = plan_walk(graph, min(edge, key=lambda node: float(np.linalg.norm(graph.positions[node] - position))))
     return plan_route(graph, walk, camera, rest=rest, outlooks=outlooks)
 
 

@@ -26,7 +26,6 @@ from pansplat.rendering.cpu.display import (
     DisplayScene,
     Layers,
     PixelFaces,
-    SelectionCache,
     blend_layers,
     blend_to_pixels,
 )
@@ -123,7 +122,6 @@ class CpuRenderer:
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
         self._groups: dict[Hashable, Int[np.ndarray, "n"]] = {}
-        self._selected = SelectionCache()
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
         self._picture: _Picture | None = None
@@ -152,7 +150,6 @@ class CpuRenderer:
         prepared = prepared or self.prepare(scene)
         self._splats, self._scene = prepared.splats, prepared.scene
         self._groups.clear()
-        self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
         self.stats = FrameStats()
@@ -275,7 +272,7 @@ class CpuRenderer:
         """Draw the image of a frame."""
         start = time.perf_counter()
         plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), frame.focal)
-        layers = self._rasterize(frame, groups, plane, self._selected)
+        layers = self._rasterize(frame, groups, plane)
         sums = layers.sums
         stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
         pixels = pooled_empty(frame.size[::-1], np.uint32)
@@ -286,9 +283,7 @@ class CpuRenderer:
         now = time.perf_counter()
         return _Picture(frame, pixels, groups, sums, _make_stats(1e3 * (now - start), stages))
 
-    def _rasterize(
-        self, frame: Frame, groups: _Groups, plane: ImagePlane, cache: SelectionCache | None = None
-    ) -> Layers:
+    def _rasterize(self, frame: Frame, groups: _Groups, plane: ImagePlane) -> Layers:
         """Rasterise the Gaussians in view of a plane."""
         camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
         selection = select_in_view(camera, frame.settings.largest_blur)
@@ -299,7 +294,6 @@ class CpuRenderer:
             len(groups.weights),
             frame.settings.near,
             selection=selection,
-            cache=cache,
             min_transmittance=self._min_transmittance,
             shift=frame.settings.shift,
         )

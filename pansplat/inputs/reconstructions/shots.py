@@ -69,12 +69,12 @@ class Reconstruction:
 
     Attributes:
         source: the file that messages name.
-        folder: of the pictures, in whose cache folder joined panoramas are described.
-        convention: of the poses.
+        folder: that of the pictures; joined panoramas are described in its cache folder.
+        convention: that of the poses.
         to_world: from the world of the file to that of the shots, rigid, after `scale`.
         scale: units of the world per unit of the file.
         shots: those whose pictures exist, in the order of the file.
-        points: of the scene, the unit of the file; may be empty.
+        points: points of the scene, in the unit of the file; may be empty.
         is_metric: whether the unit of the file is the metre; otherwise nothing is known of it.
         missing: names of pictures that were not found.
     """

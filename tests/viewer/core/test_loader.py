@@ -12,11 +12,12 @@ from refusals import expect_error
 
 from pansplat.errors import InputWarning
 from pansplat.gaussians.ply import save_ply
+from pansplat.gaussians.scene import SceneTour
 from pansplat.geometry.world import WorldFrame
 from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
-from pansplat.tours.graph import select_views
+from pansplat.tours.merge import select_views
 from pansplat_viewer.core.loader import SceneEntry, find_entries, list_panoramas, load_entry
 from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.core.state import fit_settings
@@ -196,7 +197,7 @@ def test_a_fused_tour_is_one_scene_that_is_drawn_jointly(tmp_path, small_scene):
     count = len(small_scene.cam2world)
     edges = tuple((view, view + 1, 0.5) for view in range(count - 1))
     for joint in (False, True):
-        save_ply(replace(small_scene, overlaps=edges, joint=joint), tmp_path / "tour.ply")
+        save_ply(replace(small_scene, tour=SceneTour(edges), joint=joint), tmp_path / "tour.ply")
         (entry,) = find_entries(tmp_path / "tour.ply", ReadOptions(), PredictOptions())
         loaded = load_entry(entry, PredictOptions())
         assert (loaded.entry.tour is None) == joint

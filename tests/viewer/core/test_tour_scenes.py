@@ -14,6 +14,7 @@ from PIL import Image
 from pansplat.export.film import Film, Shot
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.route import FADE_SECONDS, REST_SECONDS, plan_route
+from pansplat.tours.walks import plan_walk
 from pansplat_viewer import run
 from pansplat_viewer.capture import open_film, write_flight
 from pansplat_viewer.core.camera import Camera
@@ -136,7 +137,7 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
 
 
 def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
-    monkeypatch.setattr("pansplat.tours.graph._MAX_PREDICTED", 2)
+    monkeypatch.setattr("pansplat.tours.scene_views._MAX_PREDICTED", 2)
     scenes = TourScenes(house, max_views=64)
     predictions = scenes.list_next(None, 0.0)
     assert set(predictions) == {(0, 1), (1, 2, 3)}, "with the best neighbour of panorama 2"
@@ -281,7 +282,7 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         loaded.append(entry.views)
         return load_house(entry)
 
-    route = plan_route(house, house.plan_walk(0), rest=REST_SECONDS)
+    route = plan_route(house, plan_walk(house, 0), rest=REST_SECONDS)
     written, complete = [], []
 
     def show_file(file):
