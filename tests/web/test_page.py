@@ -123,7 +123,7 @@ def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Sc
     facing = dataclasses.replace(house, gaussians=dataclasses.replace(gaussians, means=means))
     write_page(facing, tmp_path / "wall.html")
     turns = read_header(tmp_path / "wall.html")["spots"][0]["turns"]
-    assert abs(turns[find_bin(yaw)]) > 0.5 and turns[find_bin(yaw + math.pi)] == 0, "on arrival, too"
+    assert abs(turns[find_bins(np.array(yaw))]) > 0.5 and turns[find_bins(np.array(yaw + math.pi))] == 0, "on arrival, too"
     assert math.cos(read_start(tmp_path / "wall.html")[0] - yaw) < 0
     local = house.cam2world[0, :3, :3].numpy().T @ ahead.numpy()
     start = math.atan2(local[0], local[2]), math.asin(local[1])
