@@ -65,14 +65,14 @@ from pansplat.tours.links import find_link_ring, link_parts
 from pansplat.tours.outlook import find_widest
 from pansplat.tours.route import find_angles, find_start_angles
 
-DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
-PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
+DEFAULT_GAUSSIANS = 600_000  # Gaussians of a page of about 13 MB
+_PHOTO_GAUSSIANS = 300_000, 450_000  # least and most Gaussians beside photographs in one file; about 7 and 10 MB
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
 MAX_FILE_BYTES = 64_000_000  # of a page in one file
 _TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
 _GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
-_SEEN_SHARE = 2 / 3  # of the Gaussians of a panorama, beside photographs that need the bytes
-_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # of a page: a Gaussian, and a photograph as a fraction of its squared rows
+GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
+_PHOTO_BYTES = 0.45  # bytes of a photograph in a page, over its squared rows
 _PROGRAM_BYTES = 200_000  # of a page without its data
 _PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
 _FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
@@ -129,10 +129,11 @@ def write_page(
 
     Args:
         scene: any number of panoramas; without one the page starts in the middle of the Gaussians. In a scene of a tour
-            (`pansplat.predict_tour`), the views of the nearest edge are blended, and flights follow the edges. In other
+            (`pansplat.predict`), the views of the nearest edge are blended, and flights follow the edges. In other
             scenes, all views are blended everywhere.
         path: the .html file.
-        gaussians: largest number of Gaussians; similar neighbours are merged.
+        gaussians: largest number of Gaussians, such as that of `choose_gaussians`. Similar neighbours of a scene that
+            has more are merged, and fitted to its own images; a prediction for so many is better.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
         address: of the page on the web, for previews of links to it. They show the poster of a split page.
@@ -165,13 +166,11 @@ def write_page(
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, rooms, photographs if has_pictures else ())
-    heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
     flown = _find_flown_parts(flights, tour.poor) if has_pictures else {*flights.parts}
     views = [view for view, part in enumerate(flights.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))
     scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(is_flown))
     kept = gaussians * len(views) // len(flights.parts)
-    kept = round(kept * _choose_share(kept, heights))
     if len(scene.gaussians) > kept:
         report_progress("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, kept, steps=_FIT_STEPS if has_cameras else 0)
@@ -207,6 +206,19 @@ def write_page(
     files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title, address)
     inside = sum(len(each["nodes"]) for each in header["doll"])
     return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
+
+
+def choose_gaussians(heights: Sequence[int]) -> int:
+    """The number of Gaussians of a page in one file: what photographs in it leave of 15 MB.
+
+    Args:
+        heights: of the photographs, pixels; none without them.
+    """
+    if not heights:
+        return DEFAULT_GAUSSIANS
+    left = _TARGET_BYTES - _PROGRAM_BYTES - _PHOTO_BYTES * sum(min(height, MAX_HEIGHT) ** 2 for height in heights)
+    least, most = _PHOTO_GAUSSIANS
+    return min(max(int(left / GAUSSIAN_BYTES), least), most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,16 +320,6 @@ def _find_flown_parts(flights: _Flights, poor: Sequence[Edge]) -> set[int]:
     """
     flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
     return flown if flights.edges else {*flights.parts}
-
-
-def _choose_share(count: int, heights: Sequence[int]) -> float:
-    """The share of a number of Gaussians that a page keeps: all, if photographs of their full height fit beside them.
-
-    Args:
-        heights: of the photographs in the file.
-    """
-    left = _TARGET_BYTES - _PROGRAM_BYTES - _GAUSSIAN_BYTES * count
-    return 1.0 if _PHOTO_BYTES * sum(height**2 for height in heights) <= left else _SEEN_SHARE
 
 
 def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:

@@ -24,7 +24,7 @@ from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
-from pansplat.export.page import write_page
+from pansplat.export.page import choose_gaussians, write_page
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene
@@ -231,9 +231,11 @@ def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
 
 
 def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
-    shares = [page_module._choose_share(count, [4096] * 5) for count in (0, 450_000)]
-    assert page_module._choose_share(450_000, [1024] * 5) == page_module._choose_share(450_000, []) == 1
-    assert shares[1] < 1
+    assert [choose_gaussians(heights) for heights in ([], [1024] * 5, [4096] * 5)] == [600_000, 450_000, 300_000]
+    assert 300_000 < choose_gaussians([2048] * 4) < 450_000
+
+
+def test_the_camera_flies_in_parts_with_a_good_edge() -> None:
     edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
     flights = page_module._Flights(
         torch.eye(4), np.eye(3), 0.0, 0.0, (0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), (), edges
