@@ -132,6 +132,21 @@ def test_at_an_input_pose_the_other_view_fills_a_hole(scene: Scene) -> None:
     torch.testing.assert_close(filled.color[:, hole], other.color[:, hole], atol=1e-3, rtol=0)
 
 
+def test_views_without_weight_are_drawn_only_where_holes_remain(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, draw = [], rasterize
+
+    def record(gaussians: Gaussians, *arguments: Any, **options: Any) -> Any:
+        counts.append(len(gaussians))
+        return draw(gaussians, *arguments, **options)
+
+    monkeypatch.setattr("pansplat.pipeline.drawing.rasterize", record)
+    half = replace(scene, gaussians=scene.gaussians.select(scene.gaussians.means[:, 1] < 0))
+    for shown, at, number in ((scene, 0.0, 1), (scene, 0.5, 2), (half, 0.0, 2)):
+        counts.clear()
+        render(shown, shown.pose_between(at))
+        assert len(counts) == number
+
+
 def test_deferred_blending_equals_the_blend_of_single_views(scene: Scene) -> None:
     pose = scene.pose_between(0.25)
     renderings = [render(scene, pose, blend=view) for view in range(2)]

@@ -21,7 +21,6 @@ from pansplat.inputs import folders
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.pipeline.models import can_stream, find_min_views
-from pansplat.poses.files import estimate_sets
 from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement, RefineReport, fuse_views
@@ -68,6 +67,8 @@ def load_sets(
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     collections = folders.load_collections(path, convention=convention)
     if collections[0].needs_poses:
+        from pansplat.poses.files import estimate_sets  # takes a second
+
         folder, panoramas = collections[0].folder, collections[0].unposed
         options = {"near": near, "far": far, "camera_height": camera_height}
         return estimate_sets(folder, panoramas, **options, on_unposed=on_unposed)
