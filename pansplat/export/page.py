@@ -68,18 +68,19 @@ from pansplat.tours.route import find_angles, find_start_angles
 DEFAULT_GAUSSIANS = 600_000  # Gaussians of a page of about 13 MB
 _PHOTO_GAUSSIANS = 300_000, 450_000  # least and most Gaussians beside photographs in one file; about 7 and 10 MB
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
-MAX_FILE_BYTES = 64_000_000  # of a page in one file
-_TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
-_GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
+MAX_FILE_BYTES = 64_000_000  # largest page in one file
+_TARGET_BYTES = 15_000_000  # size of a page to which the degree of harmonics and the photographs are fitted
+_GAUSSIANS_SHARE = 1 / 2  # largest part of these bytes for Gaussians beside photographs
 GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
 _PHOTO_BYTES = 0.45  # bytes of a photograph in a page, over its squared rows
-_PROGRAM_BYTES = 200_000  # of a page without its data
-_PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
-_FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
-_START_FOV = 75.0  # degrees, vertical, of a landscape image
+_PROGRAM_BYTES = 200_000  # size of a page without its data
+_PART_BYTES = 1_500_000  # bytes of data between two steps of the progress bar; divisible by 3 for base64
+_FIT_STEPS = 8  # steps that fit merged Gaussians to the images of all Gaussians
+_START_FOV = 75.0  # vertical field of view of a landscape image at the start, degrees
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
 _NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "size": (1.0, 1.0), "places": ()}
-_SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
+_SINGLE_REACH = 1.0  # how far the camera goes from a panorama without others in its part, metres; at most half way to
+# its surfaces
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 _SHADERS |= {"photograph": ("screen.vert", "photograph.frag"), "house": ("house.vert", "house.frag")}

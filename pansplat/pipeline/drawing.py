@@ -25,7 +25,7 @@ from pansplat.tours.graph import make_graph
 Drawing = Literal["exact", "original"]
 
 _OPAQUE = 0.99  # least alpha of an image without holes; those of the default model have 0.999
-_PIXEL_SECONDS = 2e-7  # time of a pixel of an image of a pair's scene, on two cores (docs/bench_raster.md)
+_PIXEL_SECONDS = 2e-7  # seconds of a pixel of an image of a pair's scene, on two cores (docs/bench_raster.md)
 
 
 def render(

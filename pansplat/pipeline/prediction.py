@@ -35,7 +35,7 @@ from pansplat.tours.graph import list_starts
 _DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
 _REFINE_STEPS = 40  # default steps of layers; more change little (docs/refinement.md)
 _JOINT_STEPS, _MIN_STEPS = 80, 8  # default steps of joint drawing, and the least for each photograph
-_STEP_SECONDS = 0.25  # time of a step on two cores, photographs of 512 rows
+_STEP_SECONDS = 0.25  # seconds of a step of a refinement on two cores, photographs of 512 rows
 
 
 @with_device
