@@ -26,7 +26,6 @@ _PUBLIC = {
     "predict": "pansplat.pipeline",
     "predict_to_file": "pansplat.pipeline",
     "fuse": "pansplat.pipeline",
-    "predict_tour": "pansplat.pipeline",
     "rasterize": "pansplat.rendering",
     "refine": "pansplat.pipeline",
     "render": "pansplat.pipeline",

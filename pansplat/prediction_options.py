@@ -58,7 +58,7 @@ class PredictOptions:
     most 1024 (for networks and tours 512)."""
     refine_steps: Annotated[CountOrNone | None, arg(name="refine")] = None
     """Steps of the refinement after the prediction; 0 for none. By default 40; where each surface
-    is kept once 80, or 8 for each panorama of a tour."""
+    is kept once 80, or 8 for each panorama of a tour; for networks 0."""
     gaussians: Annotated[Count | None, Fixed, Suppress] = None
     joint: Annotated[bool, Fixed, Suppress] = False
     cache: bool = True

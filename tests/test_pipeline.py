@@ -23,7 +23,7 @@ from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
 from pansplat.networks.weights import pack_weights, save_weights
-from pansplat.pipeline import load, load_sets, predict, predict_to_file, predict_tour, render, save
+from pansplat.pipeline import load, load_sets, predict, predict_to_file, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
 from pansplat.tours.graph import TourGraph, find_tours
@@ -103,7 +103,7 @@ def test_the_options_of_a_command_are_keywords(pair_folder: Path, sphere_predict
     )
     assert torch.equal(*(scene.gaussians.means for scene in scenes))
     assert predict(pair_folder, sphere_predictor(), options=options, height=96).height == 96
-    for call in (predict, predict_tour, lambda path, **words: predict_to_file(path, tmp_path / "x.ply", **words)):
+    for call in (predict, lambda path, **words: predict_to_file(path, tmp_path / "x.ply", **words)):
         expect_error(r"got 'heigth' \(did you mean height\?\); they are model, .*, cache", call, pair_folder, heigth=64)
 
 
@@ -135,6 +135,21 @@ def test_at_an_input_pose_the_other_view_fills_a_hole(scene: Scene) -> None:
     torch.testing.assert_close(filled.color[:, hole], other.color[:, hole], atol=1e-3, rtol=0)
 
 
+def test_views_without_weight_are_drawn_only_where_holes_remain(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, draw = [], rasterize
+
+    def record(gaussians: Gaussians, *arguments: Any, **options: Any) -> Any:
+        counts.append(len(gaussians))
+        return draw(gaussians, *arguments, **options)
+
+    monkeypatch.setattr("pansplat.pipeline.drawing.rasterize", record)
+    half = replace(scene, gaussians=scene.gaussians.select(scene.gaussians.means[:, 1] < 0))
+    for shown, at, number in ((scene, 0.0, 1), (scene, 0.5, 2), (half, 0.0, 2)):
+        counts.clear()
+        render(shown, shown.pose_between(at))
+        assert len(counts) == number
+
+
 def test_deferred_blending_equals_the_blend_of_single_views(scene: Scene) -> None:
     pose = scene.pose_between(0.25)
     renderings = [render(scene, pose, blend=view) for view in range(2)]
@@ -142,21 +157,20 @@ def test_deferred_blending_equals_the_blend_of_single_views(scene: Scene) -> Non
     torch.testing.assert_close(render(scene, pose).color, blend(renderings, weights).color)
 
 
-def test_a_folder_of_several_pairs_names_the_call_for_all_of_it_which_takes_its_path(
+def test_the_path_of_a_tour_is_predicted_as_a_whole_unless_it_holds_pairs_beside_it(
     tmp_path: Path, write_tour: Callable[..., Path], write_pair: Callable[..., Path], sphere_predictor
 ) -> None:
-    house = write_tour(tmp_path / "house", 4)
-    expect_error(r"holds 3 pairs .*predict_tour", lambda: predict(house, sphere_predictor()))
-    scene = predict_tour(house, sphere_predictor(), height=64, cache=False)
+    scene = predict(write_tour(tmp_path / "houses" / "house", 4), sphere_predictor(), height=64, cache=False)
     assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.tour.overlaps) >= 3
-    expect_error("0 tours", lambda: predict_tour(write_pair(tmp_path / "pair"), sphere_predictor()))
+    write_pair(tmp_path / "houses" / "pair")
+    expect_error("needed one pair or one tour", lambda: predict(tmp_path / "houses", sphere_predictor()))
 
 
 def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_their_holes(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor
 ) -> None:
     (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
-    whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
+    whole = predict(tour, sphere_predictor(), height=64, cache=False)
     pose = torch.eye(4, dtype=torch.float64)
     pose[2, 3] = 0.4 * 0.5  # between the first two of four panoramas in a row, 0.5 m apart
     gaussians = whole.gaussians
@@ -179,7 +193,7 @@ def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     pairs = load_sets(write_tour(tmp_path / "house", 3))
     alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
-    whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
+    whole = predict(tour, sphere_predictor(), height=64, cache=False)
     assert [edge[:2] for edge in whole.tour.overlaps] == [(0, 1), (2, 2)]
     options = {"size": (32, 64), "blend": blending}
     for views in ((0, 1), (2,)):
@@ -265,7 +279,7 @@ def masked_pair(tmp_path: Path, write_pair) -> Path:
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_config) -> Path:
     """Weights of a small network that cuts panoramas of 64 rows into four tiles; the command streams such panoramas."""
     monkeypatch.setattr(network, "_UNTILED_HEIGHT", TILED_HEIGHT // 2)
-    monkeypatch.setattr(pipeline.prediction, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
+    monkeypatch.setattr(pipeline.calls, "_MAX_CACHED_HEIGHT", TILED_HEIGHT // 2)
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
     save_weights(path, pack_weights("pansplat", small_config, PanSplat(small_config).state_dict(), compat="fixed"))
@@ -312,9 +326,9 @@ def test_the_predict_command_streams_large_predictions(
     masked_pair: Path, weights: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     command = ["predict", str(masked_pair), "--model", str(weights), "--height", str(TILED_HEIGHT), "--degree", "0"]
-    monkeypatch.setattr(pipeline.prediction, "_run", None)  # must not be called
+    monkeypatch.setattr(pipeline.calls, "predict_set", None)  # must not be called
     assert run([*command, "-o", str(tmp_path / "tiles.ply")]) == 0
-    assert "Gaussians from left, right in" in capsys.readouterr().out
+    assert "Gaussians of 2 panoramas in" in capsys.readouterr().out
     monkeypatch.undo()
     assert run([*command, "-o", str(tmp_path / "whole.ply")]) == 0  # of a height that is cached
     tiles, whole = (load(tmp_path / name).gaussians for name in ("tiles.ply", "whole.ply"))
@@ -338,7 +352,7 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
 ) -> None:
     (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     predictor = sphere_predictor()
-    scene = predict_tour(tour, predictor, cache=False)
+    scene = predict(tour, predictor, cache=False)
     assert predictor.calls == len(choose_sources(tour)) == 3
     assert scene.gaussians.views.bincount().tolist() == [64 * 128] * 4  # the smallest height
     assert scene.cam2world.equal(tour.cam2world) and scene.names == tuple(f"p{k}" for k in range(4))
@@ -346,7 +360,7 @@ def test_the_scene_of_a_tour_holds_each_panorama_once(
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))
     predictor.calls, predictor.max_views = 0, 4
-    at_once = predict_tour(tour, predictor, cache=False)
+    at_once = predict(tour, predictor, cache=False)
     assert predictor.calls == 1 and at_once.gaussians.means.equal(scene.gaussians.means)
 
 
@@ -378,9 +392,9 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     of_pairs, of_single_views = sphere_predictor(), sphere_predictor()
     monkeypatch.setitem(pipeline.models._MODELS, "default", lambda: of_single_views)
     with pytest.warns(InputWarning, match=r"house tour: 1 single view is predicted by default, because pairs needs 2"):
-        scene = predict_tour(parted_tour, PairsOnly(of_pairs), cache=False)
+        scene = predict(parted_tour, PairsOnly(of_pairs), cache=False)
     assert len(scene.cam2world) == 3 and (of_pairs.calls, of_single_views.calls) == (1, 1)
-    predict_tour(parted_tour, of_pairs, cache=False)
+    predict(parted_tour, of_pairs, cache=False)
     assert (of_pairs.calls, of_single_views.calls) == (3, 1), "without a warning"
 
 

@@ -1,4 +1,4 @@
-"""`pansplat batch`: `pansplat export` of many pairs and tours, on worker processes of one or many machines.
+"""`pansplat batch`: `pansplat predict` and `export` of many folders, on worker processes of one or many machines.
 
 The name of an output has a hash of all that it depends on. Outputs appear complete or not at all, and one that exists
 is not made again: Dask may repeat a task, and a stopped batch goes on where it was.
@@ -27,13 +27,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from pansplat.cli.export import Export, Page
-from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction
+from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction, list_panoramas
+from pansplat.cli.predict import Predict
 from pansplat.errors import InputError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions, choose_caches
 from pansplat.system.console import is_out_of_memory, print_message, progress_bar
 from pansplat.system.descriptions import describe_count
 from pansplat.system.devices import with_device
-from pansplat.system.files import expand_home, make_portable_name, require_output_folder, require_replaceable
+from pansplat.system.files import (
+    SCENE_SUFFIXES,
+    expand_home,
+    make_portable_name,
+    require_output_folder,
+    require_replaceable,
+)
 from pansplat.system.options import Count, Threads
 from pansplat.system.progress import report_progress
 
@@ -136,7 +143,7 @@ class Batch(Computation):
                 _remove_unfinished(self.out / name)
         return count
 
-    def list_exports(self, folder: Path) -> dict[str, Export]:
+    def list_commands(self, folder: Path) -> dict[str, Export | Predict]:
         """The names of the outputs of a folder, and the commands that write them."""
         from pansplat import pipeline
         from pansplat.inputs.content import hash_panorama, hash_pixels
@@ -148,7 +155,7 @@ class Batch(Computation):
         tours = find_tours(pairs)
         images = {panorama.image for tour in tours for panorama in tour.panoramas}
         for source in (*tours, *(pair for pair in pairs if pair.context[0].image not in images)):
-            panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
+            panoramas = list_panoramas(source)
             content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
             edges = () if isinstance(source, PanoramaSet) else source.list_overlaps()
             for step in (step for step in STEPS if step in self.steps):
@@ -156,16 +163,14 @@ class Batch(Computation):
                 if step == "predict" or "refine" not in self.steps:
                     options = replace(options, refine_steps=0)
                 suffix = f".{self.format}" if step == "export" else ".ply"
-                export = Export(
-                    Path(),
-                    Path(suffix),
-                    layers=step != "export",
-                    page=Page(gaussians=self.gaussians if suffix == ".html" else None),
-                    prediction=ScenePrediction(options, PairChoice(source.name, self.reading)),
-                )
-                stated = fingerprint_work(self.prediction), step, repr(export), f"{source.near} {source.far} {edges}"
+                choice = PairChoice(source.name, self.reading)
+                command = Predict(Path(), Path(suffix), layers=step != "export", prediction=options, choice=choice)
+                if suffix not in SCENE_SUFFIXES:
+                    prediction = ScenePrediction(options, choice)
+                    command = Export(Path(), Path(suffix), page=Page(gaussians=self.gaussians), prediction=prediction)
+                stated = fingerprint_work(self.prediction), step, repr(command), f"{source.near} {source.far} {edges}"
                 name = make_portable_name(source.name)[:_MAX_NAME].replace(".", "_")
-                found[f"{step}-{hash_parts(*stated, *content)[:16]}-{name}{suffix}"] = replace(export, path=folder)
+                found[f"{step}-{hash_parts(*stated, *content)[:16]}-{name}{suffix}"] = replace(command, path=folder)
         return found
 
 
@@ -207,9 +212,9 @@ def process_item(item: tuple[str, Path], batch: Batch, fingerprint: str) -> dict
                     f"worker: needed the predictor {batch.prediction.model} of the machine that started the batch, "
                     "got another one; install the same version of pansplat and the same weights on all machines"
                 )
-            for name, export in batch.list_exports(item[1]).items():
+            for name, command in batch.list_commands(item[1]).items():
                 if not (folder / name).exists():
-                    replace(export, out=folder / name).run()
+                    replace(command, out=folder / name).run()
                     num_made += 1
                 files.append(folder / name)
             for step in batch.steps:

@@ -13,7 +13,7 @@ from tyro.conf import Positional, subcommand
 
 import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
-from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_set, predict_scene
+from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_set
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.files import require_output_folder, require_replaceable
@@ -72,6 +72,7 @@ class BenchRaster(_Options):
         """Measure, print the tables and write the files; an interruption keeps the measured rows."""
         import torch
 
+        from pansplat import pipeline
         from pansplat.bench import raster
 
         height = self.height or (128 if self.quick else 512)
@@ -82,7 +83,7 @@ class BenchRaster(_Options):
         groups = raster.list_raster_groups(height, backends, threads)
         if _SAMPLE.is_dir():
             options = PredictOptions("sweep", height=max(small, MIN_HEIGHT), refine_steps=0)
-            scene = predict_scene(choose_set(_SAMPLE, PairChoice()), options)
+            scene = pipeline.predict(choose_set(_SAMPLE, PairChoice()), options=options)
             sample = raster.BenchScene(_SAMPLE.stem, lambda: scene.gaussians, scene.pose_between(0.5))
             groups.append(raster.make_sample_group(sample, small, backends, threads))
         budget = 0.2 if self.quick else 2.0

@@ -1,4 +1,4 @@
-"""`pansplat export`: a scene or tour in the formats of other programs, as a web page, plan or training set.
+"""`pansplat export`: a scene file in another format; panoramas as a web page, plan, training set or photographs.
 
 Each kind of file is a dataclass of the options that only it has.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Computation, Out, ScenePrediction
+from pansplat.cli.inputs import Computation, Out, ScenePrediction, list_panoramas
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count, list_first
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 _INDEX_NAME = "index.html"  # name of the page in a folder
 _MIN_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # for each panorama: least without a note; suggested
 _MAX_GAUSSIANS = 2_000_000  # most Gaussians that the note suggests for a page in one file
-_GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
 _MIN_POINT_OPACITY, _MAX_POINTS = 0.1, 200_000  # points of a training set: least opacity, and their number
 
 
@@ -53,12 +52,17 @@ class _SceneFile:
     """Write a .ply of plain points with colours, for programs without Gaussians."""
 
     def write(self, export: Export) -> None:
-        """Write the scene with each surface once, or with --layers all Gaussians, and print its size."""
+        """Write the scene of a file with each surface once, or with --layers all Gaussians, and print its size."""
         from pansplat.gaussians.formats import save_scene
         from pansplat.gaussians.ply import save_points
 
         if self.points and find_scene_suffix(export.out) != ".ply":
             raise InputError(f"--points is for {self.files}, got {export.out}; leave it out")
+        if not is_scene_file(export.path):
+            raise InputError(
+                f"{export.path}: needed a scene file to write {export.out}, got another path; pansplat predict makes "
+                "scenes of panoramas"
+            )
         scene, _ = export.open(joint=not export.layers)
         write, kind = (save_points, "points") if self.points else (save_scene, "Gaussians")
         write(scene, export.out)
@@ -90,8 +94,8 @@ class Page:
     files: ClassVar = "an .html page"
 
     gaussians: Count | None = None
-    """Largest number of Gaussians, 600,000 by default, beside photographs in one file 450,000; similar neighbours are
-    merged."""
+    """Largest number of Gaussians: 600,000 by default, beside photographs in one file 300,000 to 450,000, as these
+    leave bytes. The prediction has so many; similar neighbours of a scene file are merged."""
     photo_height: Annotated[int, Meta(ge=0, le=4096)] | None = None
     """Largest height of the photographs that the page shows at panoramas; 0 for none. By default what fits into 15 MB,
     at least 1024, in a folder that of the files, at most 4096."""
@@ -104,7 +108,7 @@ class Page:
 
     def write(self, export: Export) -> None:
         """Write the page, print its size, and serve it."""
-        from pansplat.export.page import DEFAULT_GAUSSIANS, PHOTO_GAUSSIANS, write_page
+        from pansplat.export.page import GAUSSIAN_BYTES, choose_gaussians, write_page
         from pansplat.export.page_server import serve_page
 
         out, split = export.out, not export.out.suffix
@@ -117,10 +121,15 @@ class Page:
             out = out / _INDEX_NAME
         shows_all = not export.crop  # photographs would show what a crop leaves out
         has_photographs = shows_all and self.photo_height != 0 and not is_scene_file(export.path)
-        count = self.gaussians or (PHOTO_GAUSSIANS if has_photographs and not split else DEFAULT_GAUSSIANS)
+
+        def choose_count(heights: Sequence[int]) -> int:
+            shown = heights if has_photographs and not split else ()
+            return self.gaussians or choose_gaussians([min(height, self.photo_height or height) for height in shown])
+
         with progress_bar():
             with stage(0.8):
-                scene, photographs = export.open(gaussians=count)
+                scene, photographs = export.open(choose_count)
+            count = choose_count([photograph.image_height for photograph in photographs])
             out.parent.mkdir(parents=True, exist_ok=True)
             page = write_page(
                 scene,
@@ -156,7 +165,7 @@ class Page:
         panoramas = max(len(scene.cam2world), 1)
         if self.gaussians is None and count // panoramas < _MIN_GAUSSIANS:
             more = min(_GOOD_GAUSSIANS * panoramas, _MAX_GAUSSIANS)
-            size = (page.num_bytes + _GAUSSIAN_BYTES * (more - page.num_gaussians)) / 1e6
+            size = (page.num_bytes + GAUSSIAN_BYTES * (more - page.num_gaussians)) / 1e6
             print(
                 f"note: {out}: {count // panoramas:,} Gaussians for each of {describe_count(panoramas, 'panorama')}; "
                 f"--gaussians {more} shows more detail in about {size:.0f} MB",
@@ -196,7 +205,6 @@ class _TrainingSet:
         from pansplat.export.training_set import POINTS, write_dataset
         from pansplat.gaussians.ply import make_colors, save_points
         from pansplat.gaussians.scene import prune
-        from pansplat.inputs.panorama_sets import PanoramaSet
         from pansplat.inputs.reconstructions.nerfstudio import Z_UP
         from pansplat.system.atomic import replacing_folder
 
@@ -209,16 +217,16 @@ class _TrainingSet:
                 "the folder"
             )
         with stage(0.8):
-            scene, source = export.prediction.open_panoramas(export.path, joint=not export.layers)
+            scene, source = export.prediction.open(export.path, joint=not export.layers)
+        assert source is not None
         gaussians = prune(scene.gaussians, degree=0, min_opacity=_MIN_POINT_OPACITY)
         gaussians = gaussians.select(torch.isfinite(gaussians.means).all(dim=1))
         if len(gaussians) > _MAX_POINTS:
             chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]
             gaussians = gaussians.select(chosen.sort().values)
-        panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
         views = [
             dataclasses.replace(panorama, cam2world=pose)
-            for panorama, pose in zip(panoramas, scene.frame.globalize(scene.cam2world), strict=True)
+            for panorama, pose in zip(list_panoramas(source), scene.frame.globalize(scene.cam2world), strict=True)
         ]
         means = scene.frame.globalize_places(gaussians.means).cpu().numpy()
         colors = make_colors(gaussians).cpu().numpy()
@@ -263,16 +271,16 @@ class _Photographs:
 
 @dataclass(frozen=True)
 class Export(Computation):
-    """Write a scene, or the prediction of a pair or tour, in the format of the file's suffix (docs/formats.md), as a
-    web page (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan
-    with straight walls and areas (.svg, .png), or as a folder to train further from (--training-set): cube faces, poses
-    and points for COLMAP, nerfstudio, gsplat and brush."""
+    """Write a scene file in the format of another suffix (docs/formats.md), or a scene, pair or tour as a web page
+    (.html, or a name without suffix for a folder that any web server shows; docs/web.md), as a floor plan with straight
+    walls and areas (.svg, .png), or as a folder to train further from (--training-set): cube faces, poses and points
+    for COLMAP, nerfstudio, gsplat and brush."""
 
     path: Positional[Path]
     """A scene file, one panorama, a folder of panoramas, with or without poses, or a web tour."""
     out: Out
-    """The file to write: .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page; .svg or .png
-    for a floor plan. A folder, without a suffix, for a web page with photographs of their own
+    """The file to write: of a scene file .ply, .compressed.ply, .spz, .splat, .sog or .glb; .html for a web page;
+    .svg or .png for a floor plan. A folder, without a suffix, for a web page with photographs of their own
     resolution, which are loaded as they are needed; a new one with --training-set for cube faces with poses, and with
     --photos for the photographs of a tour."""
     degree: Annotated[int, Meta(ge=0, le=4)] | None = None
@@ -283,8 +291,8 @@ class Export(Computation):
     remove_floaters: bool = False
     """Leave out isolated Gaussians in free space."""
     layers: bool = False
-    """Keep all Gaussians of each view, for deferred blending. By default each surface is kept once, for programs that
-    draw all Gaussians together (docs/formats.md)."""
+    """Keep all Gaussians of each view of a scene file or training set, for deferred blending. By default each surface
+    is kept once, for programs that draw all Gaussians together (docs/formats.md)."""
     scene: _SceneFile = field(default_factory=_SceneFile)
     page: Page = field(default_factory=Page)
     plan: _FloorPlan = field(default_factory=_FloorPlan)
@@ -312,30 +320,30 @@ class Export(Computation):
         return 0
 
     @progress_bar()
-    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[PanoramaSet]]:
+    def open(
+        self, choose_count: Callable[[Sequence[int]], int] | None = None, *, joint: bool = False
+    ) -> tuple[Scene, list[PanoramaSet]]:
         """The scene of the file, pair or tour as it is to be written, and its photographs.
 
         Args:
-            joint: whether each surface is kept once.
-            gaussians: of a page; see `pansplat.predict_tour`.
+            choose_count: see `ScenePrediction.open`.
+            joint: whether each surface of a scene file is kept once.
         """
-        from pansplat import pipeline
         from pansplat.export.photographs import list_photographs
         from pansplat.refinement import fuse_views
 
-        if not is_scene_file(self.path):
-            with stage(0.9):
-                scene, source = self.prediction.open_panoramas(self.path, gaussians, joint=joint)
+        with stage(0.9):
+            scene, source = self.prediction.open(self.path, choose_count)
+        if source is not None:
             edited = self._edit(scene)
             known, views = scene.cam2world.tolist(), range(len(scene.cam2world))
             if len(edited.cam2world) < len(known):  # a crop leaves views out
                 views = [known.index(pose) for pose in edited.cam2world.tolist()]
             return edited, list_photographs(source, views)
-        scene = pipeline.load(self.path)
         if not joint or scene.joint or len(scene.cam2world) < 2:
             return self._edit(scene), []
         print(
-            f"note: {self.path}: each surface is kept once (--layers keeps all); an export of the folder of the "
+            f"note: {self.path}: each surface is kept once (--layers keeps all); pansplat predict of the folder of the "
             "photographs fits the Gaussians to them, too",
             file=sys.stderr,
         )

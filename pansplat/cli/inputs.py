@@ -6,6 +6,7 @@ Modules of this package import torch and everything that needs it inside functio
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,7 +23,7 @@ from pansplat.system.progress import CONNECTED, POSED, stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.panorama_sets import PanoramaSet
+    from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
     from pansplat.tours.graph import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
@@ -53,8 +54,8 @@ class PairChoice:
     """How to read a panorama, a folder of panoramas or a web tour, and which of its pairs to use."""
 
     pair: str | None = None
-    """Name or number (from 1) of the pair, if the folder holds several; the first by default. For an export also the
-    name of a tour."""
+    """Name of a tour, or name or number (from 1) of a pair, if the folder holds several; by default the first tour,
+    else the first pair."""
     reading: Annotated[ReadOptions, arg(name="")] = field(default_factory=ReadOptions)
 
 
@@ -74,59 +75,66 @@ class ScenePrediction:
     )
     choice: Annotated[PairChoice, arg(prefix_name=False)] = field(default_factory=PairChoice)
 
-    def open(self, path: Path) -> tuple[Scene, PanoramaSet | None]:
-        """The scene of a scene file, or the prediction of a pair's folder, and the pair."""
+    def open(
+        self, path: Path, choose_count: Callable[[Sequence[int]], int] | None = None, *, joint: bool = False
+    ) -> tuple[Scene, PanoramaSet | TourGraph | None]:
+        """The scene of a scene file, or that of the chosen pair or tour, and its panoramas in the scene's order.
+
+        Args:
+            path: the scene file or folder.
+            choose_count: the number of Gaussians that is needed beside photographs of some heights.
+            joint: see `pansplat.predict`.
+        """
         from pansplat import pipeline
+        from pansplat.images.image_files import read_height
 
         if is_scene_file(path):
             return pipeline.load(path), None
-        pair = choose_set(path, self.choice)
-        return predict_scene(pair, self.options), pair
+        source, count = choose_source(path, self.choice), None
+        if choose_count is not None:
+            count = choose_count([read_height(view.image) for view in list_panoramas(source)])
+        return pipeline.predict(source, options=replace(self.options, gaussians=count, joint=joint)), source
 
-    def open_panoramas(
-        self, path: Path, gaussians: int | None = None, *, joint: bool = False
-    ) -> tuple[Scene, PanoramaSet | TourGraph]:
-        """The scene of the chosen pair, or of the first tour of a folder, and its panoramas in the scene's order.
 
-        Args:
-            path: the folder.
-            gaussians: of a page; see `pansplat.predict_tour`.
-            joint: see `pansplat.predict`; predictions of networks are returned as they are.
-        """
-        from pansplat.tours.graph import find_tours
-        from pansplat.tours.overlap import connect
+def choose_source(path: Path, choice: PairChoice) -> PanoramaSet | TourGraph:
+    """The chosen pair or tour of a path; without a choice the first tour, else the first pair, with a note if there are
+    more."""
+    from pansplat.tours.graph import find_tours
+    from pansplat.tours.overlap import connect
 
-        pairs = load_choice(path, self.choice)
-        tours = [tour for tour in find_tours(pairs) if self.choice.pair in (None, tour.name)]
-        options = replace(self.options, gaussians=gaussians, joint=joint)
-        if not tours:
-            pair = pick_set(path, pairs, self.choice)
-            return predict_scene(pair, options), pair
-        alone = sum(a == b for a, b in tours[0].overlaps)
-        kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
-        more = f"; left out: {describe_count(len(tours) - 1, 'other tour')}" if len(tours) > 1 else ""
-        count = describe_count(len(tours[0]), "panorama")
-        print(f"note: {path}: a tour of {count} ({kinds}--pair chooses one pair){more}", file=sys.stderr)
-        with stage(CONNECTED):
-            tour = connect(tours[0])
-        return predict_scene(tour, options), tour
+    pairs = _load_sets(path, choice)
+    tours = [tour for tour in find_tours(pairs) if choice.pair in (None, tour.name)]
+    if not tours:
+        return _pick_set(path, pairs, choice)
+    alone = sum(a == b for a, b in tours[0].overlaps)
+    kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
+    more = f"; left out: {describe_count(len(tours) - 1, 'other tour')}" if len(tours) > 1 else ""
+    count = describe_count(len(tours[0]), "panorama")
+    print(f"note: {path}: a tour of {count} ({kinds}--pair chooses one pair){more}", file=sys.stderr)
+    with stage(CONNECTED):
+        return connect(tours[0])
+
+
+def list_panoramas(source: PanoramaSet | TourGraph) -> tuple[Panorama, ...]:
+    """The panoramas of a pair or tour, in the order of its scene."""
+    from pansplat.inputs.panorama_sets import PanoramaSet
+
+    return source.context if isinstance(source, PanoramaSet) else source.panoramas
 
 
 def choose_set(path: Path, choice: PairChoice) -> PanoramaSet:
     """The chosen pair of a folder; without a choice the first one, with a note if there are more."""
-    return pick_set(path, load_choice(path, choice), choice)
+    return _pick_set(path, _load_sets(path, choice), choice)
 
 
-def load_choice(path: Path, choice: PairChoice) -> list[PanoramaSet]:
-    """The pairs of a folder."""
+def _load_sets(path: Path, choice: PairChoice) -> list[PanoramaSet]:
     from pansplat import pipeline
 
     with stage(POSED):
         return pipeline.load_sets(path, **vars(choice.reading))
 
 
-def pick_set(path: Path, pairs: list[PanoramaSet], choice: PairChoice) -> PanoramaSet:
-    """The chosen one of the pairs of a folder; without a choice the first one, with a note if there are more."""
+def _pick_set(path: Path, pairs: list[PanoramaSet], choice: PairChoice) -> PanoramaSet:
     names = [pair.name for pair in pairs]
     listed = ", ".join(f"{number}: {name}" for number, name in enumerate(names, 1))
     if choice.pair is None:
@@ -139,18 +147,6 @@ def pick_set(path: Path, pairs: list[PanoramaSet], choice: PairChoice) -> Panora
     if choice.pair in numbered:
         return numbered[choice.pair]
     raise InputError(f"--pair {choice.pair}: {path} holds {listed}")
-
-
-def predict_scene(source: PanoramaSet | TourGraph, options: PredictOptions) -> Scene:
-    """Predict and refine the scene of a pair or tour; networks draw layers jointly."""
-    from pansplat import pipeline
-    from pansplat.inputs.panorama_sets import PanoramaSet
-
-    model = pipeline.load_predictor(options)
-    options = replace(options, joint=options.joint and not pipeline.can_stream(model))
-    if isinstance(source, PanoramaSet):
-        return pipeline.predict(source, model, options=options)
-    return pipeline.predict_tour(source, model, options=options)
 
 
 def parse_blend(text: str) -> str | int:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Fixed, Positional, Suppress
 
-from pansplat.cli.inputs import Computation, Out, PairChoice, choose_set, predict_scene
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_set
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
@@ -110,7 +110,7 @@ class Refine(Computation):
             pair = choose_set(self.photographs, self.choice)
             return scene, pipeline.load_photographs(pair, self.prediction.height or scene.height)
         pair = choose_set(self.path, self.choice)
-        scene = predict_scene(pair, self.prediction)
+        scene = pipeline.predict(pair, options=self.prediction)
         return scene, pipeline.load_photographs(pair, scene.height)
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pansplat.inputs.panorama_sets import PanoramaSet
     from pansplat.rendering import Rendering
     from pansplat.tours.camera_path import CameraPath
+    from pansplat.tours.graph import TourGraph
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # rows of a video: perspective, and panoramic
@@ -34,7 +35,7 @@ _VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # rows of a video: perspecti
 
 @dataclass(frozen=True)
 class Render(Computation):
-    """Render a scene, or the prediction of a pair, to an image (.png, .jpg, .webp, .exr) or a video (.mp4) that
+    """Render a scene, or the prediction of a pair or tour, to an image (.png, .jpg, .webp, .exr) or a video (.mp4) that
     shows the photograph while the camera stands at a panorama."""
 
     path: Positional[Path]
@@ -172,7 +173,9 @@ class Render(Computation):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
         return list_flight(plan_visits(scene), self.fps, self.fov, self.seconds)
 
-    def _make_film(self, scene: Scene, source: PanoramaSet | None, options: dict[str, Any], count: int) -> Film:
+    def _make_film(
+        self, scene: Scene, source: PanoramaSet | TourGraph | None, options: dict[str, Any], count: int
+    ) -> Film:
         """Draws the scene, and photographs that no option replaces; `count` is the number of frames."""
         import functools
 

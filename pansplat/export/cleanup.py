@@ -20,20 +20,21 @@ from torch.nn import functional
 from pansplat.errors import InputError
 from pansplat.gaussians.crop import Box, crop, keep_gaussians
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import pad_equirect, row_weights, uv_from_directions
+from pansplat.geometry.equirect import pad_equirect, row_weights
 from pansplat.pipeline import render
+from pansplat.refinement.fusion import OPAQUE, look_up
 from pansplat.rendering import rasterize
 from pansplat.system.descriptions import describe_count
 from pansplat.system.progress import report_progress, stage
 
-_NEIGHBOURS = 16  # of a Gaussian
-_CHUNK = 1 << 17  # Gaussians whose neighbours are looked for at once
-_ALIKE = 0.15  # largest difference of the logarithms of two distances from a camera that are alike
-_FEW = 2  # neighbours of an isolated Gaussian that are as far are fewer
-_CONFIRMED = 0.03  # distance from a Gaussian of another camera, relative to that from the own camera
-_IN_FRONT = 0.85  # largest distance from a camera, relative to that of the surface behind
-_OPAQUE = 0.5  # least alpha of that surface
-_DEPTH_ROWS, _PICTURE_ROWS = 512, 256  # of the images that are compared
+_NEIGHBOURS = 16  # Gaussians beside a Gaussian, in the directions of its camera, that are compared with it
+_CHUNK = 1 << 17  # Gaussians whose neighbours are searched at once
+_SAME_DISTANCE = 0.15  # largest difference of the logarithms of two distances from a camera that count as the same
+_MIN_COMPANIONS = 2  # least neighbours at the same distance of a Gaussian that is not isolated
+_CONFIRMED = 0.03  # largest distance to a Gaussian of another camera that confirms one, over that to its own camera
+_IN_FRONT = 0.85  # largest distance of a floater from its camera, over that of the surface behind it
+_DEPTH_ROWS = 512  # most rows of the image of that surface
+_PICTURE_ROWS = 256  # most rows of the pictures that are compared before and after
 _MAX_PICTURES = 16  # cameras at which pictures are compared
 
 
@@ -178,8 +179,8 @@ def _are_nearer(offsets: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 
         part = slice(start, start + _CHUNK)
         neighbours = tree.query(rays[part], _NEIGHBOURS + 1, workers=torch.get_num_threads())[1][:, 1:]
         behind = other_logs[neighbours] - logs[part, None]
-        alike = (np.abs(behind) < _ALIKE).sum(axis=1)
-        is_nearer[part] = (alike < _FEW) & ((behind > _ALIKE).sum(axis=1) > _NEIGHBOURS // 2)
+        companions = (np.abs(behind) < _SAME_DISTANCE).sum(axis=1)
+        is_nearer[part] = (companions < _MIN_COMPANIONS) & ((behind > _SAME_DISTANCE).sum(axis=1) > _NEIGHBOURS // 2)
     return is_nearer
 
 
@@ -195,10 +196,7 @@ def _are_in_front(
     """Whether points are clearly nearer to a camera than all surfaces in and around their pixels, of which one is."""
     rows = min(height, _DEPTH_ROWS)
     drawn = rasterize(surface, pose, size=(rows, 2 * rows))
-    depth = torch.where(drawn.alpha > _OPAQUE, drawn.depth, torch.inf)[None]
+    depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, torch.inf)[None]
     nearest = -functional.max_pool2d(pad_equirect(-depth, 1), 3, stride=1)[0]
-    offsets = (points.double() - pose[:3, 3].to(points.device)) @ pose[:3, :3].to(points.device)
-    uv = uv_from_directions(offsets)
-    row, column = (uv[:, 1] * rows).long().clamp(0, rows - 1), (uv[:, 0] * 2 * rows).long() % (2 * rows)
-    found = nearest[row, column]
-    return (offsets.norm(dim=1) < _IN_FRONT * found) & torch.isfinite(found)
+    distances, found = look_up(nearest, points, pose)
+    return (distances < _IN_FRONT * found) & torch.isfinite(found)

@@ -68,17 +68,17 @@ from pansplat.tours.route import find_angles, find_start_angles
 from pansplat.tours.scene_views import choose_scene_views
 from pansplat.tours.walks import find_next_nodes, plan_walk
 
-DEFAULT_GAUSSIANS = 600_000  # make a page of about 13 MB
-PHOTO_GAUSSIANS = 450_000  # make one of about 10 MB, to which photographs are added
+DEFAULT_GAUSSIANS = 600_000  # Gaussians of a page of about 13 MB
+_PHOTO_GAUSSIANS = 300_000, 450_000  # least and most Gaussians beside photographs in one file; about 7 and 10 MB
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
 MAX_FILE_BYTES = 64_000_000  # largest page in one file
-_TARGET_BYTES = 15_000_000  # in larger pages harmonics of higher degree are left out, and photographs are smaller
-_GAUSSIANS_SHARE = 1 / 2  # part of the target for Gaussians, where there are photographs
-_SEEN_SHARE = 2 / 3  # part of the Gaussians that is kept where photographs need the bytes
-_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # size in a page: of a Gaussian, and of a photograph as a factor of its rows^2
+_TARGET_BYTES = 15_000_000  # size of a page to which the degree of harmonics and the photographs are fitted
+_GAUSSIANS_SHARE = 1 / 2  # largest part of these bytes for Gaussians beside photographs
+GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
+_PHOTO_BYTES = 0.45  # bytes of a photograph in a page, over its squared rows
 _PROGRAM_BYTES = 200_000  # size of a page without its data
-_PART_BYTES = 1_500_000  # size of the data between two steps of the progress bar; divisible by 3
-_FIT_STEPS = 8  # steps of the fit of merged Gaussians to the images of all
+_PART_BYTES = 1_500_000  # bytes of data between two steps of the progress bar; divisible by 3 for base64
+_FIT_STEPS = 8  # steps that fit merged Gaussians to the images of all Gaussians
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
 _NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
@@ -131,10 +131,11 @@ def write_page(
 
     Args:
         scene: any number of panoramas; without one the page starts in the middle of the Gaussians. In a scene of a tour
-            (`pansplat.predict_tour`), the views of the nearest edge are blended, and flights follow the edges. In other
+            (`pansplat.predict`), the views of the nearest edge are blended, and flights follow the edges. In other
             scenes, all views are blended everywhere.
         path: the .html file.
-        gaussians: largest number of Gaussians; similar neighbours are merged.
+        gaussians: largest number of Gaussians, such as that of `choose_gaussians`. Similar neighbours of a scene that
+            has more are merged, and fitted to its own images; a prediction for so many is better.
         split: write the data to the folder `NAME_files` beside the page, for large scenes.
         title: of the page; by default the name of the file.
         address: of the page on the web, for previews of links to it. They show the poster of a split page.
@@ -165,13 +166,11 @@ def write_page(
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, rooms, photographs if has_pictures else ())
-    heights = [min(each.image_height, photo_height or MAX_HEIGHT) for each in photographs if has_pictures and not split]
     flown = _find_flown_parts(flights, tour.poor) if has_pictures else {*flights.parts}
     views = [view for view, part in enumerate(flights.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))
     scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(is_flown))
     kept = gaussians * len(views) // len(flights.parts)
-    kept = round(kept * _choose_share(kept, heights))
     if len(scene.gaussians) > kept:
         report_progress("merging Gaussians", 0.1)
         scene = _merge(scene, flights.parts, kept, steps=_FIT_STEPS if has_cameras else 0)
@@ -205,6 +204,19 @@ def write_page(
     files = _write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title, address)
     inside = sum(len(each["nodes"]) for each in header["doll"])
     return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
+
+
+def choose_gaussians(heights: Sequence[int]) -> int:
+    """The number of Gaussians of a page in one file: what photographs in it leave of 15 MB.
+
+    Args:
+        heights: of the photographs, pixels; none without them.
+    """
+    if not heights:
+        return DEFAULT_GAUSSIANS
+    left = _TARGET_BYTES - _PROGRAM_BYTES - _PHOTO_BYTES * sum(min(height, MAX_HEIGHT) ** 2 for height in heights)
+    least, most = _PHOTO_GAUSSIANS
+    return min(max(int(left / GAUSSIAN_BYTES), least), most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,16 +293,6 @@ def _find_flown_parts(flights: _Flights, poor: Sequence[Edge]) -> set[int]:
     """
     flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
     return flown if flights.edges else {*flights.parts}
-
-
-def _choose_share(count: int, heights: Sequence[int]) -> float:
-    """The share of a number of Gaussians that a page keeps: all, if photographs of their full height fit beside them.
-
-    Args:
-        heights: of the photographs in the file.
-    """
-    left = _TARGET_BYTES - _PROGRAM_BYTES - _GAUSSIAN_BYTES * count
-    return 1.0 if _PHOTO_BYTES * sum(height**2 for height in heights) <= left else _SEEN_SHARE
 
 
 def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:

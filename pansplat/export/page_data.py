@@ -9,6 +9,7 @@ import gzip
 import io
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
@@ -271,7 +272,8 @@ def pack_gaussians(
     blocks = [
         b"".join(plane[start:end].tobytes() for plane in (*planes, *quantised.T)) for start, end in pairwise(ends)
     ]
-    contents = tuple(_compress(blocks[rank]) for rank in np.argsort(order))
+    with ThreadPoolExecutor() as threads:
+        contents = tuple(threads.map(_compress, (blocks[rank] for rank in np.argsort(order))))
     starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
     return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale)
 

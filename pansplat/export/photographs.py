@@ -11,10 +11,12 @@ import base64
 import dataclasses
 import hashlib
 import io
+import json
 import math
 import re
 import unicodedata
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,25 +33,30 @@ from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import read_face_size
 from pansplat.images.masks import mask_holes
+from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, make_unique_name
 from pansplat.system.progress import report_progress
+from pansplat.system.source_hash import hash_sources
+from pansplat.system.store import Store, hash_parts
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.merge import make_graph, select_views
 from pansplat.tours.scene_views import choose_scene_views
 
-MIN_HEIGHT = 1024  # least height of a photograph in a page, pixels, unless its file is smaller
-MAX_HEIGHT = 4096  # largest height of a photograph in a folder, pixels
-_FACE = 2 / math.pi  # largest size of a face, of the photograph's height: its centre is as dense
-_STEP = 16  # divides the size of a face, pixels
+MIN_HEIGHT = 1024  # least rows of a photograph in a page, unless the file has fewer
+MAX_HEIGHT = 4096  # most rows of a photograph in a folder
+_FACE = 2 / math.pi  # largest size of a face over the height of the photograph: its centre has as many pixels
+_STEP = 16  # the size of a face is a multiple of it, pixels
 _LABEL = 40  # letters of the name of a panorama in names of files
-_PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
-_TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
-# Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
+_PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels, pixels
+_TILE = 1344  # largest size of a tile, pixels; a photograph of 4,096 rows has 36
+# Qualities of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the
+# gradient.
 _QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
-_SHRINK = 0.95  # largest factor of the next height, where one is too large for the page
-_HIDDEN_ROWS = 512  # rows of the image of the Gaussians that replaces what masks hide
-_GUARD, _FEATHER = 3, 1 / 128  # borders of what masks hide: hidden pixels, and a share of the height that fades
+_SHRINK = 0.95  # largest factor between a height that is too large for the page and the next one
+_HIDDEN_ROWS = 512  # rows of the image of the Gaussians that is shown in what masks hide
+_GUARD = 3  # pixels around what is hidden that are not shown
+_FEATHER = 1 / 128  # width of the margin around them that fades, over the height of the photograph
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +144,9 @@ def pack_photographs(
         can_shrink, expected = height is None and rows > MIN_HEIGHT, 0.0
         for view, photograph in enumerate(photographs):
             report_progress("packing photographs", view / len(photographs))
-            image = read_photograph(scene, view, photograph, rows)
-            size = min(_FACE * image.shape[1], sizes[view])
             rotation = scene.cam2world[view, :3, :3].double().numpy()
-            packed.append(_pack(image, size, labels[view], rotation, qualities[0]))
+            tiles = _open_tiles(scene, view, photograph, rows, sizes[view], qualities[0])
+            packed.append(PackedPhotograph(labels[view], *tiles, rotation))
             expected = sum(each.num_bytes for each in packed) * len(photographs) / len(packed)
             limit = (1.5 if len(packed) < len(photographs) else 1) * num_bytes
             if expected > limit and (can_shrink or (height is None and len(qualities) > 1)):
@@ -154,10 +160,36 @@ def pack_photographs(
             qualities.pop(0)
 
 
-@torch.no_grad()
+def _open_tiles(
+    scene: Scene, view: int, photograph: PanoramaSet, rows: int, most: int, quality: int
+) -> tuple[int, tuple[tuple[int, int], ...], tuple[bytes, ...]]:
+    """Height, levels and tiles of a photograph of at most some rows, and of faces of at most a size.
+
+    They are stored by the content of the photograph, unless Gaussians are shown in what masks hide.
+    """
+    gains = scene.gains[view] if scene.joint and scene.gains else ()
+    pixels, options = hash_pixels(photograph.context, photograph.siblings), json.dumps([rows, most, quality, gains])
+    store, key = Store(photograph.folder), hash_parts(hash_sources(__name__), pixels, options)
+    if (found := store.read("tiles", key)) is not None:
+        return found[0], found[1], tuple(tile.tobytes() for tile in found[2])
+    image, shown = load_photograph(photograph, rows)
+    image = _cover_hidden(scene, view, image, shown)
+    levels, tiles = _pack(image, min(_FACE * image.shape[1], most), quality)
+    if shown.min() >= 1:
+        store.write("tiles", key, (image.shape[1], levels, [np.frombuffer(tile, np.uint8) for tile in tiles]))
+    return image.shape[1], levels, tiles
+
+
 def read_photograph(scene: Scene, view: int, photograph: PanoramaSet, height: int) -> Float[Tensor, "3 height width"]:
     """A photograph of at most a height, with the exposure of the Gaussians, and without what its masks hide."""
-    image, shown = load_photograph(photograph, height)
+    return _cover_hidden(scene, view, *load_photograph(photograph, height))
+
+
+@torch.no_grad()
+def _cover_hidden(
+    scene: Scene, view: int, image: Float[Tensor, "3 height width"], shown: Float[Tensor, "height width"]
+) -> Float[Tensor, "3 height width"]:
+    """The picture of `load_photograph` with the exposure of the Gaussians, and these in what masks hide."""
     if scene.joint and scene.gains:  # the Gaussians of single views have the exposure of their photographs
         image = image / torch.tensor(scene.gains[view]).to(image)[:, None, None]
     if shown.min() >= 1:
@@ -198,20 +230,24 @@ def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarra
 
 
 def _pack(
-    image: Float[Tensor, "3 height width"], most: float, label: str, rotation: np.ndarray, quality: int
-) -> PackedPhotograph:
-    """The tiles of all levels; the largest one has faces of at most a size."""
+    image: Float[Tensor, "3 height width"], most: float, quality: int
+) -> tuple[tuple[tuple[int, int], ...], tuple[bytes, ...]]:
+    """The levels and the tiles of all of them; the largest one has faces of at most a size."""
     size = max(int(most / _STEP) * _STEP, _STEP)
     sizes = [smaller for smaller in (_PREVIEW, _MIDDLE) if 1.3 * smaller < size]
     levels = tuple((each, -(-each // -(-each // _TILE))) for each in (*sizes, size))
-    tiles: list[list[bytes]] = [[] for _ in levels]
-    for face in cut_faces(image, size):
-        pixels = (255 * face + 0.5).astype(np.uint8)
+
+    def encode_face(pixels: UInt8[np.ndarray, "size size 3"]) -> list[list[bytes]]:
+        tiles = []
         for level, (smaller, tile) in enumerate(levels):
             reduced = cv2.resize(pixels, (smaller, smaller), interpolation=cv2.INTER_AREA)
             is_preview = level == 0 < len(levels) - 1
-            tiles[level] += _encode(reduced, tile, _PREVIEW_QUALITY if is_preview else quality)
-    return PackedPhotograph(label, image.shape[1], levels, tuple(each for level in tiles for each in level), rotation)
+            tiles.append(_encode(reduced, tile, _PREVIEW_QUALITY if is_preview else quality))
+        return tiles
+
+    with ThreadPoolExecutor() as threads:
+        faces = list(threads.map(encode_face, ((255 * face + 0.5).astype(np.uint8) for face in cut_faces(image, size))))
+    return levels, tuple(tile for level in zip(*faces, strict=True) for face in level for tile in face)
 
 
 def _encode(pixels: UInt8[np.ndarray, "size size 3"], tile: int, quality: int) -> list[bytes]:

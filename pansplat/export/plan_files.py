@@ -1,4 +1,4 @@
-"""Floor plans of straight walls as drawings: SVG and PNG of one figure.
+"""Floor plans of straight walls as drawings: SVG, and PNG of the same.
 
 The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed, and beside
 them. They are 1:50 on paper.
@@ -6,11 +6,14 @@ them. They are 1:50 on paper.
 
 from __future__ import annotations
 
+import html
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -30,17 +33,33 @@ from pansplat.tours.plan import Plan, Room
 
 SUFFIXES = (".svg", ".png")
 
-_PAPER = 0.02  # metres of paper for a metre: 1:50
+_PAPER = 0.02  # metres of paper for a metre of the plan: 1:50
 _INCH = 0.0254  # metres
-_DOTS_PER_INCH = 150
-_MARGIN, _LINE = 0.8, 0.35  # around a storey, and between lines of notes, metres
-_TEXT, _SMALL_TEXT, _LEAST_TEXT = 0.22, 0.13, 0.08  # heights, metres
-_SMALL_SHEET, _SMALL_SHEET_TEXT = 5.5, 0.17  # metres: width and largest text that a quarter of a window shows legibly
-_LETTER = 0.72  # width of a letter, of its height
-_MEASURED = 0.6  # metres, the shortest wall whose length is written
+_POINTS = 72 * _PAPER / _INCH  # points of paper for a metre of the plan
+_DOTS_PER_INCH = 150  # resolution of the PNG
+_MARGIN = 0.8  # space around a storey, metres of the plan
+_LINE = 0.35  # distance of two lines of notes, metres of the plan
+_TEXT, _SMALL_TEXT, _LEAST_TEXT, _NOTE = 0.22, 0.13, 0.08, 0.15  # heights of capital letters, metres of the plan
+# The plan in a corner of a page: up to this width, in metres, its texts can be read in a quarter of a window; the
+# height of its largest texts, metres.
+_SMALL_SHEET, _SMALL_SHEET_TEXT = 5.5, 0.17
+_LETTER = 0.72  # mean width of a letter over the height of a capital one, of DejaVu Sans
+_CAP_HEIGHT = 0.73  # height of a capital letter over the size of the font, of DejaVu Sans
+_MEASURED = 0.6  # shortest wall whose length is written, metres
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
-_CAP_HEIGHT = 0.73  # of a letter, of the font's size
-_POINT = _INCH / 72
+_FLOOR, _INK, _DOOR, _DOT = "#f2f0ea", "#222", "#c26a1b", "#2b7bb9"
+_COLORS = {"LENGTHS": "#777", "PANORAMAS": _DOT}  # colours of texts by layer; others are in ink
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A line, closed around its fill if it has one; its width in metres."""
+
+    places: Float[np.ndarray, "n 2"]
+    color: str
+    width: float
+    fill: str = "none"
+    is_dashed: bool = False
 
 
 @dataclass(frozen=True)
@@ -231,6 +250,21 @@ class _Drawing:
         """The places of all panoramas."""
         return self._centers + np.stack([self._layout[0][piece] for piece in self._pieces])
 
+    @property
+    def dot(self) -> float:
+        """Diameter of the dot of a panorama."""
+        return 0.12 * self.enlarged
+
+    def list_lines(self) -> list[_Line]:
+        """The outlines of the rooms, those that are placed on top, the doors, and a bar of a metre below."""
+        lines = [
+            _Line(self.outline(room), _INK, 0.07 if room.is_closed else 0.03, _FLOOR, not room.is_placed)
+            for room in sorted(self.rooms, key=lambda room: room.is_placed)
+        ]
+        lines += [_Line(ends, *style) for ends in self.doors for style in ((_FLOOR, 0.09), (_DOOR, 0.035))]
+        bar = -_LINE * len(self.notes) - 0.4  # on a small sheet, which has no notes, it is outside
+        return [*lines, _Line(np.array(((_MARGIN / 2, bar), (_MARGIN / 2 + 1, bar))), _INK, 0.05)]
+
     @cached_property
     def notes(self) -> list[str]:
         """Lines below the plan."""
@@ -290,53 +324,78 @@ class _Drawing:
         return texts
 
 
-def _place_notes(notes: list[str]) -> list[_Text]:
-    places = [(_MARGIN / 2, -_LINE * (row + 1)) for row in range(len(notes))]
-    return [_Text("NOTES", place, note, 0.15, is_centred=False) for place, note in zip(places, notes, strict=True)]
-
-
 def _draw_figure(drawing: _Drawing, kind: str) -> bytes:
-    """The plan as a file of a figure, 1:50 on paper: "svg", whose texts are texts, or "png"."""
-    from matplotlib import rc_context
+    """The plan as a file, 1:50 on paper: "svg", whose texts are texts, or "png"."""
+    notes, (width, height) = drawing.notes, drawing.size
+    places = [(_MARGIN / 2, -_LINE * (row + 1)) for row in range(len(notes))]
+    lines = [_Text("NOTES", place, note, _NOTE, is_centred=False) for place, note in zip(places, notes, strict=True)]
+    texts = [*drawing.list_texts(), *lines]
+    width = max(width, _NOTE * _LETTER * max(map(len, notes), default=0) + _MARGIN)
+    below = _LINE * len(notes) + _MARGIN if notes else 0.0
+    return (_write_svg if kind == "svg" else _write_png)(drawing, texts, (width, height, below))
+
+
+def _write_svg(drawing: _Drawing, texts: Sequence[_Text], sizes: tuple[float, float, float]) -> bytes:
+    """An SVG in points of paper. `sizes`: width, and heights of the plan and of the notes below it, metres."""
+    width, height, below = sizes
+    size = f"{_POINTS * width:.2f}", f"{_POINTS * (height + below):.2f}"
+    marks = [f'<rect width="{size[0]}" height="{size[1]}" fill="#fff"/>']
+    for line in drawing.list_lines():
+        points = " ".join(f"{x:.2f},{y:.2f}" for x, y in _POINTS * ((0, height) + line.places * (1, -1)))
+        step = _POINTS * line.width
+        dashes = f' stroke-dasharray="{3.7 * step:.2f} {1.6 * step:.2f}"' if line.is_dashed else ""
+        marks.append(
+            f'<{"polyline" if line.fill == "none" else "polygon"} points="{points}" fill="{line.fill}" '
+            f'stroke="{line.color}" stroke-width="{step:.2f}"{dashes}/>'
+        )
+    for x, y in _POINTS * ((0, height) + drawing.panoramas * (1, -1)):
+        marks.append(f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{_POINTS * drawing.dot / 2:.2f}" fill="{_DOT}"/>')
+    for text in texts:
+        (x, y), font = (_POINTS * text.place[0], _POINTS * (height - text.place[1])), _POINTS * text.size / _CAP_HEIGHT
+        content = html.escape(text.text.encode(errors="backslashreplace").decode())
+        marks.append(
+            f'<text transform="translate({x:.2f} {y:.2f}) rotate({-text.angle:.2f})" y="{_CAP_HEIGHT / 2 * font:.2f}" '
+            f'font-size="{font:.2f}" text-anchor="{"middle" if text.is_centred else "start"}" '
+            f'fill="{_COLORS.get(text.layer, _INK)}">{content}</text>'
+        )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{size[0]}pt" height="{size[1]}pt" '
+        f'viewBox="0 0 {size[0]} {size[1]}" font-family="DejaVu Sans, Verdana, sans-serif"><!-- {SOFTWARE} -->\n'
+        + "\n".join(marks)
+        + "\n</svg>\n"
+    ).encode()
+
+
+def _write_png(drawing: _Drawing, texts: Sequence[_Text], sizes: tuple[float, float, float]) -> bytes:
+    """The same as a PNG by matplotlib."""
     from matplotlib.figure import Figure
 
-    notes = drawing.notes
-    width, height = drawing.size
-    width = max(width, 0.15 * _LETTER * max(map(len, notes), default=0) + _MARGIN)
-    below = _LINE * len(notes) + _MARGIN if notes else 0.0
+    width, height, below = sizes
     figure = Figure(figsize=(width * _PAPER / _INCH, (height + below) * _PAPER / _INCH))
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(-below, height))
     axes.set_axis_off()
-
-    def points(metres: float) -> float:
-        return metres * _PAPER / _POINT
-
-    for room in drawing.rooms:
-        dashes = "solid" if room.is_placed else "dashed"
-        style = {"facecolor": "#f2f0ea", "edgecolor": "#222", "linestyle": dashes}
-        style["linewidth"] = points(0.07 if room.is_closed else 0.03)
-        above = 2 * room.is_placed - 4  # what is sure is on top
-        axes.fill(*drawing.outline(room).T, gid="room", joinstyle="miter", zorder=above, **style)
-    for ends in drawing.doors:
-        axes.plot(*ends.T, color="#f2f0ea", linewidth=points(0.09), solid_capstyle="butt", zorder=0)
-        axes.plot(*ends.T, color="#c26a1b", linewidth=points(0.035), solid_capstyle="butt", zorder=0)
-    axes.plot(*drawing.panoramas.T, "o", color="#2b7bb9", markersize=points(0.12 * drawing.enlarged), markeredgewidth=0)
-    for text in [*drawing.list_texts(), *_place_notes(notes)]:
+    for line in drawing.list_lines():
+        style: dict[str, Any] = {
+            "linewidth": _POINTS * line.width,
+            "linestyle": "dashed" if line.is_dashed else "solid",
+        }
+        if line.fill == "none":
+            axes.plot(*line.places.T, color=line.color, solid_capstyle="butt", **style)
+        else:
+            axes.fill(*line.places.T, facecolor=line.fill, edgecolor=line.color, joinstyle="miter", **style)
+    axes.plot(*drawing.panoramas.T, "o", color=_DOT, markersize=_POINTS * drawing.dot, markeredgewidth=0)
+    for text in texts:
         axes.text(
             *text.place,
             text.text.encode(errors="backslashreplace").decode(),
-            fontsize=points(text.size) / _CAP_HEIGHT,
+            fontsize=_POINTS * text.size / _CAP_HEIGHT,
             rotation=text.angle,
             rotation_mode="anchor",
             ha="center" if text.is_centred else "left",
             va="center",
-            color={"LENGTHS": "#777", "PANORAMAS": "#2b7bb9"}.get(text.layer, "#222"),
+            color=_COLORS.get(text.layer, _INK),
             parse_math=False,
         )
-    bar = -_LINE * len(notes) - 0.4  # on a small sheet it is below it
-    axes.plot((_MARGIN / 2, _MARGIN / 2 + 1), (bar, bar), color="#222", linewidth=points(0.05))
-    file = io.BytesIO()
-    stated = {"Creator": SOFTWARE, "Date": None} if kind == "svg" else {"Software": SOFTWARE}
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "pansplat"}):
-        figure.savefig(file, format=kind, dpi=_DOTS_PER_INCH, metadata=stated)
-    return file.getvalue()
+    with io.BytesIO() as file:
+        figure.savefig(file, format="png", dpi=_DOTS_PER_INCH, metadata={"Software": SOFTWARE})
+        return file.getvalue()

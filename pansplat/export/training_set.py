@@ -9,13 +9,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
 from pansplat.geometry.cubemap import FACES, face_poses, face_rotations
-from pansplat.geometry.equirect import pad_equirect, uv_from_directions
+from pansplat.geometry.equirect import pad_equirect
 from pansplat.images.blur_masks import fill_hidden
 from pansplat.images.image_files import read_height, read_panorama, write_image
 from pansplat.images.rig_images import Lens
@@ -26,10 +25,10 @@ from pansplat.system.progress import report_progress, stage
 
 POINTS = "points.ply"
 
-_MAX_HEIGHT = 8192  # of a panorama, pixels
-_MASK_HEIGHT = 512  # pixels
+_MAX_HEIGHT = 8192  # most rows of a panorama that is cut into faces
+_MASK_HEIGHT = 512  # rows of the masks that are cut into faces
 _LOSSLESS = (".png", ".exr", ".tif", ".tiff")  # pictures whose faces are PNG; those of others are JPG
-_MARGIN = 2  # pixels, of the cubic filter
+_MARGIN = 2  # pixels around a panorama that the cubic filter reads
 _BAND_ROWS = 256  # rows of a face that are sampled together
 
 
@@ -98,15 +97,19 @@ def cut_faces(image: Float[Tensor, "3 height width"], size: int) -> Iterator[Flo
     for channel in range(3):
         padded[..., channel] = pad_equirect(image[channel : channel + 1], _MARGIN)[0]
     del image  # gigabytes
-    position = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
-    for rotation in face_rotations():
+    position = (np.arange(size) + 0.5) / size * 2 - 1
+    for rotation in face_rotations().numpy():
         face = np.empty((size, size, 3), np.float32)
         for first in range(0, size, _BAND_ROWS):
-            y, x = torch.meshgrid(position[first : first + _BAND_ROWS], position, indexing="ij")
-            uv = uv_from_directions(torch.stack((x, y, torch.ones_like(x)), dim=-1) @ rotation.T).numpy()
+            band = position[first : first + _BAND_ROWS, None]
+            axes = position[None], band, np.ones((1, 1))
+            # Of faces at the side the azimuth is that of a column: a sum without terms of 0 stays one row.
+            right, down, ahead = (sum(c * axis for c, axis in zip(row, axes, strict=True) if c) for row in rotation)
+            u, v = np.arctan2(right, ahead) / (2 * math.pi), np.arctan2(down, np.hypot(right, ahead)) / math.pi
             columns, rows = (
-                (uv[..., axis] * count - 0.5 + _MARGIN).astype(np.float32) for axis, count in ((0, width), (1, height))
+                np.broadcast_to((0.5 + share) * count - 0.5 + _MARGIN, (len(band), size)).astype(np.float32)
+                for share, count in ((u, width), (v, height))
             )
-            band = cv2.remap(padded, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            face[first : first + _BAND_ROWS] = band.clip(0, 1)
+            sampled = cv2.remap(padded, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            face[first : first + _BAND_ROWS] = sampled.clip(0, 1)
         yield face

@@ -25,7 +25,8 @@ from pansplat.tours.scene_views import choose_scene_views
 
 Drawing = Literal["exact", "original"]
 
-_PIXEL_SECONDS = 2e-7  # time of a pixel of an image of a pair's scene, on two cores (docs/bench_raster.md)
+_OPAQUE = 0.99  # least alpha of an image without holes; those of the default model have 0.999
+_PIXEL_SECONDS = 2e-7  # seconds of a pixel of an image of a pair's scene, on two cores (docs/bench_raster.md)
 
 
 def render(
@@ -46,7 +47,8 @@ def render(
         cam2world: pose of the camera, OpenCV axes, in the world of `scene.cam2world`; `scene.frame.localize` brings a
             pose of the user's world there.
         blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
-            a tour, those of the views at the nearest edge, and other views of its part fill their holes. "joint"
+            a tour, those of the views at the nearest edge. Views without weight are rendered only where these leave
+            holes, which they fill, of a tour those of the part. "joint"
             renders all Gaussians together, of a tour those of the part; a number renders those of one view only. By
             default as the scene is made for (`Scene.joint`).
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
@@ -98,9 +100,12 @@ def render(
     near = torch.tensor(group, device=pose.device)
     forward = pose[:3, 2] if layout == "pinhole" else None
     weights[near] = blend_weights(pose[:3, 3], scene.cam2world[group, :3, 3].to(pose), forward)
-    views = [scene.gaussians.select(scene.gaussians.views == view) for view in shown]
-    renderings = [rasterize_gaussians(view, pose) for view in views]
-    return blend_renderings(renderings, weights[torch.tensor(shown, device=pose.device)])
+    order, renderings = sorted(shown, key=lambda view: -float(weights[view])), []
+    for view in order:
+        if weights[view] == 0 and float(torch.stack([each.alpha for each in renderings]).amax(dim=0).min()) > _OPAQUE:
+            break
+        renderings.append(rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == view), pose))
+    return blend_renderings(renderings, weights[torch.tensor(order[: len(renderings)], device=pose.device)])
 
 
 def make_renderer(scene: Scene, work: str, count: int, **options: Any) -> Callable[..., Rendering]:

@@ -1,10 +1,10 @@
-"""Loads pairs, predicts the scene of a pair, of one panorama or of loaded views, and refines it."""
+"""Loads sets of panoramas, predicts the scene of one set or of loaded views, and refines it."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,33 +16,26 @@ from torch import Tensor
 
 from pansplat.cache import CachedPrediction, CachedScene
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.formats import save_scene
-from pansplat.gaussians.ply import save_ply_parts
-from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
+from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.inputs import folders
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import ONE_POSITION, Views
-from pansplat.pipeline.models import can_stream, find_min_views, load_predictor
-from pansplat.poses.files import estimate_sets
-from pansplat.prediction_options import PredictOptions, choose_caches
+from pansplat.pipeline.models import can_stream, find_min_views
+from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement, RefineReport, fuse_views
 from pansplat.rendering.color_fit import fit_colors
 from pansplat.rendering.gains import equalize_gaussians, equalize_images, measure_gains
 from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import choose_device, note_full_card, with_device
-from pansplat.system.files import find_scene_suffix
 from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
-from pansplat.system.progress import POSED, report_progress, stage
-from pansplat.tours.graph import find_tours
+from pansplat.system.progress import report_progress, stage
 from pansplat.tours.merge import list_starts
 
 _DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
-_MAX_CACHED_HEIGHT = 512  # rows of a network's prediction that is cached; taller ones are written tile by tile
-_MAX_COLOR = 1.5  # largest value of images in [0, 1], which filters may exceed; images of 8 bits have larger ones
 _REFINE_STEPS = 40  # default steps of layers; more change little (docs/refinement.md)
 _JOINT_STEPS, _MIN_STEPS = 80, 8  # default steps of joint drawing, and the least for each photograph
-_STEP_SECONDS = 0.25  # time of a step on two cores, photographs of 512 rows
+_STEP_SECONDS = 0.25  # seconds of a step of a refinement on two cores, photographs of 512 rows
 
 
 @with_device
@@ -74,6 +67,8 @@ def load_sets(
         raise InputError(f"`camera_height` must be a positive number of metres, got {camera_height}")
     collections = folders.load_collections(path, convention=convention)
     if collections[0].needs_poses:
+        from pansplat.poses.files import estimate_sets  # takes a second
+
         folder, panoramas = collections[0].folder, collections[0].unposed
         options = {"near": near, "far": far, "camera_height": camera_height}
         return estimate_sets(folder, panoramas, **options, on_unposed=on_unposed)
@@ -83,87 +78,6 @@ def load_sets(
 def choose_height(pair: PanoramaSet, predictor: Predictor) -> int:
     """The height to predict a pair at: that of its photographs, at most the largest default of the predictor."""
     return max(MIN_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
-
-
-@with_device
-@with_progress_bar
-def predict(
-    source: PanoramaSet | Views | str | Path,
-    model: str | Path | Predictor | None = None,
-    *,
-    options: PredictOptions | None = None,
-    on_predicted: Callable[[Scene], None] | None = None,
-    **keywords: Any,
-) -> Scene:
-    """Predict the scene of a pair's context panoramas, and refine it.
-
-    The prediction of a pair and its refinement are cached in its folder (`pansplat.cache`).
-
-    Args:
-        source: a pair; the path of a panorama or of a folder that holds exactly one pair; or loaded panoramas (never
-            cached).
-        model: the name of a predictor, a file of weights, or a predictor; by default that of the options.
-        options: all of the following keywords in one object; a keyword replaces its value.
-        on_predicted: called with the prediction before it is refined.
-        compat, precision, depth_network: see `load_model`; without effect on a predictor object.
-        height: panoramas are resized to (height, 2 height); by default `choose_height`. Loaded panoramas keep their
-            size.
-        refine_steps: of the refinement. By default 0, for none; that of `PredictOptions` is None, which is
-            `choose_refine_steps`. A single view is not refined.
-        gaussians: largest number after a refinement; similar neighbours are merged before it.
-        joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without
-            a refinement, only the colours are fitted.
-        cache: whether to read and write the cache.
-        device: of all work in the call, "cpu", "cuda" or "auto": a graphics card for long work (docs/platforms.md).
-    """
-    return _run(_prepare(source, model, options, keywords), on_predicted)
-
-
-@with_device
-@with_progress_bar
-def predict_to_file(
-    source: PanoramaSet | Views | str | Path,
-    path: str | Path,
-    model: str | Path | Predictor | None = None,
-    *,
-    options: PredictOptions | None = None,
-    degree: int | None = None,
-    **keywords: Any,
-) -> int:
-    """Predict a scene and write it in the format of the file's suffix (docs/formats.md).
-
-    The prediction of a network that is not fused, refined or cached is computed tile by tile, in bounded memory; a .ply
-    is written tile by tile, too. The Gaussians are those of `predict`, ordered by tile.
-
-    Args:
-        source, model, options, **keywords: see `predict`.
-        path: the file.
-        degree: highest degree of harmonics in the file; None keeps all.
-        cache: see `predict`; without options by default not, and networks do not cache heights above 512.
-
-    Returns:
-        The number of Gaussians in the file.
-    """
-    suffix = find_scene_suffix(path)
-    if options is None:
-        keywords.setdefault("cache", False)
-    task = _prepare(source, model, options, keywords)
-    predictor, options = task.predictor, task.options
-    is_cached = options.cache and (options.height or 0) <= _MAX_CACHED_HEIGHT
-    if can_stream(predictor) and not (options.joint or options.refine_steps or is_cached):
-        views = task.views
-        parts: Iterator[Gaussians] = predictor.stream(  # pyright: ignore[reportAttributeAccessIssue]
-            views.images, views.cam2world, views.near, views.far, masks=views.masks
-        )
-        pruned = (prune(part, degree=degree) for part in parts)
-        if suffix == ".ply":
-            return save_ply_parts(_make_scene(CachedScene(empty_gaussians()), task), pruned, path)
-        scene = _make_scene(CachedScene(Gaussians.cat(list(pruned))), task)
-    else:
-        scene = _run(task)
-        scene = replace(scene, gaussians=prune(scene.gaussians, degree=degree))
-    save_scene(scene, path)
-    return len(scene.gaussians)
 
 
 @with_device
@@ -271,7 +185,7 @@ def load_photographs(pair: PanoramaSet, height: int) -> Views:
 
 
 @dataclass(frozen=True)
-class _Task:
+class Task:
     """What is predicted and how; `options` has no defaults that are still to be chosen."""
 
     source: PanoramaSet | Views
@@ -291,44 +205,25 @@ class _Task:
         return torch.stack([panorama.cam2world for panorama in self.source.context])
 
 
-def choose_options(
-    model: str | Path | Predictor | None, options: PredictOptions | None, keywords: dict[str, Any]
-) -> tuple[Predictor, PredictOptions]:
-    """The predictor and the options of a call; without an object of options there is no refinement by default."""
-    is_named = isinstance(model, (str, Path))
-    options = PredictOptions(refine_steps=0) if options is None else options
-    options = options.replace(**keywords, **({"model": str(model)} if is_named else {}))
-    RefineConfig(gaussians=options.gaussians)
-    steps = options.refine_steps
-    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 0):
-        raise InputError(f"`refine_steps` must be a whole number of at least 0, got {steps}")
-    return load_predictor(options) if model is None or is_named else model, options
-
-
-def _prepare(
-    source: PanoramaSet | Views | str | Path,
-    model: str | Path | Predictor | None,
-    options: PredictOptions | None,
-    keywords: dict[str, Any],
-) -> _Task:
-    """The task of a call; what cannot be predicted is refused before it is read."""
-    predictor, options = choose_options(model, options, keywords)
-    with stage(POSED), choose_caches(options):
-        pair = _load_source(source)
-    loaded = isinstance(pair, Views)
-    count, needed = len(pair.images if loaded else pair.context), find_min_views(predictor)
+def make_task(source: PanoramaSet | Views, predictor: Predictor, options: PredictOptions) -> Task:
+    """The task of a prediction; what cannot be predicted is refused before it is read."""
+    loaded = isinstance(source, Views)
+    count, needed = len(source.images if loaded else source.context), find_min_views(predictor)
     if count < needed:
-        files = pair.names if loaded else [str(view.image) for view in pair.context]
+        files = source.names if loaded else [str(view.image) for view in source.context]
         raise InputError(
             f"{', '.join(files) or 'the input'}: {predictor.name} needed {needed} or more panoramas of one room, got "
             f"{count}; choose the model default, which accepts a single one, or add one."
         )
-    joint = options.joint and count > 1
-    steps = choose_refine_steps(count, joint=joint) if options.refine_steps is None else options.refine_steps
-    height = pair.images.shape[-2] if loaded else options.height or choose_height(pair, predictor)
-    task = _Task(pair, predictor, replace(options, height=height, refine_steps=steps if count > 1 else 0, joint=joint))
-    if count > 1 and float(torch.pdist(task.cam2world[:, :3, 3]).max()) < ONE_POSITION * pair.near:
-        names = pair.names if loaded else [view.name for view in pair.context]
+    is_network = can_stream(predictor)
+    joint = options.joint and count > 1 and not is_network
+    steps = options.refine_steps
+    if steps is None:
+        steps = 0 if is_network else choose_refine_steps(count, joint=joint)
+    height = source.images.shape[-2] if loaded else options.height or choose_height(source, predictor)
+    task = Task(source, predictor, replace(options, height=height, refine_steps=steps if count > 1 else 0, joint=joint))
+    if count > 1 and float(torch.pdist(task.cam2world[:, :3, 3]).max()) < ONE_POSITION * source.near:
+        names = source.names if loaded else [view.name for view in source.context]
         warnings.warn(
             f"{', '.join(names)}: the cameras are at one place, so that depth is that of each photograph alone; check "
             "the poses.",
@@ -339,7 +234,7 @@ def _prepare(
 
 
 @stage()
-def _run(task: _Task, on_predicted: Callable[[Scene], None] | None = None) -> Scene:
+def predict_set(task: Task, on_predicted: Callable[[Scene], None] | None = None) -> Scene:
     """The scene of a task; its prediction is made for `on_predicted`, too, if the refinement is in the cache."""
     options = task.options
     if not options.refine_steps:
@@ -362,11 +257,11 @@ def _run(task: _Task, on_predicted: Callable[[Scene], None] | None = None) -> Sc
             cached.write(content)
     else:
         report_progress("read from the cache", 1.0)
-    return _make_scene(content, task, options.joint)
+    return make_scene(content, task, options.joint)
 
 
 @stage()
-def _predict_views(task: _Task) -> Scene:
+def _predict_views(task: Task) -> Scene:
     """The scene without a refinement."""
     cached, predictor = CachedPrediction(task.source, task.predictor, task.options, refined=False), task.predictor
     content = cached.read()
@@ -378,41 +273,11 @@ def _predict_views(task: _Task) -> Scene:
         cached.write(content)
     else:
         report_progress("read from the cache", 1.0)
-    return _make_scene(content, task)
+    return make_scene(content, task)
 
 
-def _load_source(source: PanoramaSet | Views | str | Path) -> PanoramaSet | Views:
-    """The pair of a path; a pair or views as they are, with tensors in place of arrays."""
-    if isinstance(source, (str, Path)):
-        pairs = load_sets(source)
-        if len(pairs) == 1:
-            return pairs[0]
-        names = ", ".join(pair.name for pair in pairs[:8]) + (", ..." if len(pairs) > 8 else "")
-        every = ", or all in one scene: predict_tour(path)" if len(find_tours(pairs)) == 1 else ""
-        advice = f"choose one: predict(load_sets(path)[0]){every}"
-        raise InputError(f"{source} holds {len(pairs)} pairs ({names}); {advice}")
-    if isinstance(source, PanoramaSet):
-        return source
-    if isinstance(source, Views):
-        return _as_tensors(source)
-    raise InputError(
-        f"needed a pair, a path or Views, got {type(source).__name__}; "
-        "give arrays as Views(images, cam2world, masks, near, far, names)"
-    )
-
-
-def _as_tensors(views: Views) -> Views:
-    images, masks = torch.as_tensor(views.images), torch.as_tensor(views.masks, dtype=torch.bool)
-    images = images / 255 if images.dtype == torch.uint8 else images.float()
-    if images.numel() and float(images.nan_to_num().max()) > _MAX_COLOR:
-        raise InputError(
-            f"`images` must be RGB in [0, 1], got values up to {float(images.max()):g}; divide them by 255"
-        )
-    poses = torch.as_tensor(views.cam2world, dtype=torch.float64)
-    return replace(views, images=images, masks=masks, cam2world=poses)
-
-
-def _make_scene(content: CachedScene, task: _Task, joint: bool = False) -> Scene:
+def make_scene(content: CachedScene, task: Task, joint: bool = False) -> Scene:
+    """The scene of a task with the Gaussians of its prediction or refinement."""
     source, gaussians, cam2world = task.source, content.gaussians, task.cam2world.double()
     panoramas = source.context if isinstance(source, PanoramaSet) else ()
     first = source if isinstance(source, Views) else source.context[0]

@@ -6,26 +6,21 @@ import itertools
 import math
 import warnings
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import torch
 
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.inputs.panorama_sets import PanoramaSet
-from pansplat.pipeline.models import find_min_views, load_model
-from pansplat.pipeline.prediction import choose_options, choose_refine_steps, fuse, load_sets, predict, refine_scene
-from pansplat.prediction_options import PredictOptions, choose_caches
+from pansplat.pipeline.models import can_stream, find_min_views, load_model
+from pansplat.pipeline.prediction import choose_refine_steps, fuse, make_task, predict_set, refine_scene
+from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import fuse_views
-from pansplat.system.console import with_progress_bar
-from pansplat.system.devices import with_device
 from pansplat.system.options import MIN_HEIGHT
-from pansplat.system.progress import CONNECTED, POSED, stage
-from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.system.progress import stage
+from pansplat.tours.graph import TourGraph
 from pansplat.tours.merge import merge_scenes, select_views
-from pansplat.tours.overlap import connect
 from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_scene_views, choose_sources
 
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
@@ -33,32 +28,12 @@ _GAUSSIANS_PER_SQUARE = 0.75  # Gaussians of a panorama over the square of its r
 _MAX_MERGED = 4  # Gaussians that become one on average
 
 
-@with_device
-@with_progress_bar
-def predict_tour(
-    tour: TourGraph | str | Path,
-    model: str | Path | Predictor | None = None,
-    *,
-    options: PredictOptions | None = None,
-    **keywords: Any,
-) -> Scene:
-    """Predict one scene of all panoramas of a tour: the scenes of its parts, merged.
-
-    `default` and `sweep` predict a part at once; networks predict scenes of two or three panoramas. Single views are
-    predicted by `default`, with a warning, if the model needs two or more views.
-
-    Args:
-        tour: of `pansplat.tours.overlap.connect`, or the path of a folder that holds the panoramas of one tour.
-        model, options, compat, precision, depth_network, refine_steps, cache: see `predict`.
-        height: panoramas are resized to (height, 2 height); by default that of the photographs, at most 512.
-        gaussians: number that the scene is needed in, such as that of a web page. Each panorama has an equal part after
-            a refinement; without one the scene may have more.
-        joint: see `predict`; the refinement is then that of each part of the tour as a whole, and not cached.
-    """
-    predictor, options = choose_options(model, options, keywords)
-    if isinstance(tour, (str, Path)):
-        with choose_caches(options):
-            tour = _load_only_tour(tour)
+def predict_tour(tour: TourGraph, predictor: Predictor, options: PredictOptions) -> Scene:
+    """The scene of all panoramas of a tour; see `pansplat.predict`."""
+    is_network = can_stream(predictor)
+    if is_network and options.refine_steps is None:
+        options = replace(options, refine_steps=0)
+    options = replace(options, joint=options.joint and not is_network)
     warn_of_single_views(tour, predictor)
     max_views, is_refined = find_max_views(predictor), options.joint and options.refine_steps != 0
     total = len(choose_sources(tour, max_views))
@@ -70,7 +45,7 @@ def predict_tour(
         number, pair = next(counter), tour.make_set(views)
         fitted = fit_to_scene(each, pair, part)
         with stage(number / total, f"scene {number} of {total}: "):
-            return predict(pair, choose_predictor(pair, predictor), options=fitted)
+            return predict_set(make_task(pair, choose_predictor(pair, predictor), fitted))
 
     with stage(0.5 if is_refined else 1.0):
         scene = merge_scenes(tour, predict_scene, max_views)
@@ -140,14 +115,3 @@ def fit_to_scene(options: PredictOptions, pair: PanoramaSet, gaussians: float = 
             height //= 2
     count = None if math.isinf(gaussians) else max(int(gaussians * len(pair.context)), 1)
     return replace(options, height=height, gaussians=count)
-
-
-def _load_only_tour(path: str | Path) -> TourGraph:
-    with stage(POSED):
-        tours = find_tours(load_sets(path))
-    if len(tours) != 1:
-        names = f" ({', '.join(tour.name for tour in tours[:8])}{', ...' if len(tours) > 8 else ''})" if tours else ""
-        advice = "give its folder" if tours else "predict one pair: predict(load_sets(path)[0])"
-        raise InputError(f"{path}: needed the panoramas of one tour, got {len(tours)} tours{names}; {advice}")
-    with stage(CONNECTED):
-        return connect(tours[0])

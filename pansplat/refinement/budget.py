@@ -28,7 +28,7 @@ DROP_ERROR = 5e-3  # largest mean absolute change of an image's colours by all G
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at, here and in the steps of a refinement
 _MAX_MERGED_OPACITY = 0.99  # a merged Gaussian with more opacity becomes wider (docs/refinement.md)
 _DIRECTION_BITS = 15  # a half axis of the cells of directions, on a Z-order curve, has 2^15 steps
-_NEIGHBOURS = 8  # candidates for a merger before and after a Gaussian along the curve
+_NEIGHBOURS = 8  # Gaussians before, and as many behind, along the curve of directions that one may merge with
 _BASE_COST = 0.008  # cost of a merger between equal Gaussians, as a difference of colours
 _MERGED_SHARE = 0.5  # share of a round's pairs that is merged (docs/what_was_tried.md)
 

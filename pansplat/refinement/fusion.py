@@ -22,9 +22,9 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import pad_equirect, uv_from_directions
 from pansplat.rendering import rasterize
 
-_HEIGHT = 512  # rows of the depth of a view's surface
-_MAX_OFFSET = 0.1  # largest distance of a Gaussian from a surface that it belongs to, relative to the surface's depth
-BACKGROUND_LEVEL = 2  # the finest level of the background
+_HEIGHT = 512  # most rows of the image of the surface that a view sees
+_MAX_OFFSET = 0.1  # largest distance of a Gaussian behind the surface that it belongs to, over the depth of the surface
+BACKGROUND_LEVEL = 2  # the finest of the levels that a view has behind its surfaces
 OPAQUE = 0.5  # least alpha of a pixel that shows a surface
 
 
@@ -72,8 +72,16 @@ def are_seen(
     points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], reach: Float[Tensor, "height width"]
 ) -> Bool[Tensor, "n"]:
     """Whether a camera sees the points, before or at its surfaces (`measure_reach`)."""
-    height, width = reach.shape
+    distances, found = look_up(reach, points, pose)
+    return distances <= (1 + _MAX_OFFSET) * found
+
+
+def look_up(
+    depths: Float[Tensor, "height width"], points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Distances of points from a camera, and its depths in their directions."""
+    height, width = depths.shape
     offsets = (points.double() - pose[:3, 3].to(points.device)) @ pose[:3, :3].to(points.device)
     uv = uv_from_directions(offsets)
     row = (uv[:, 1] * height).long().clamp(0, height - 1)
-    return offsets.norm(dim=1) <= (1 + _MAX_OFFSET) * reach[row, (uv[:, 0] * width).long() % width]
+    return offsets.norm(dim=1), depths[row, (uv[:, 0] * width).long() % width]

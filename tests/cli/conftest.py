@@ -43,7 +43,17 @@ def predict(room: Path, tmp_path: Path) -> Callable[..., int]:
     """A function that runs `pansplat predict` on the room and returns its status."""
 
     def run_predict(*arguments: str) -> int:
-        start = ["predict", str(room), "-o", str(tmp_path / "scene.ply"), "--model", "sphere", "--layers"]
+        start = [
+            "predict",
+            str(room),
+            "-o",
+            str(tmp_path / "scene.ply"),
+            "--model",
+            "sphere",
+            "--layers",
+            "--refine",
+            "0",
+        ]
         return run([*start, "--height", str(HEIGHT), *arguments])
 
     return run_predict

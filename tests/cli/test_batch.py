@@ -152,7 +152,7 @@ def test_other_pairs_and_approximate_places_have_outputs_of_other_names(
         (house / "pairs.json").write_text(json.dumps({"pairs": pairs}))
         (house / "poses.json").write_text(json.dumps(poses | {"estimate": {"approximate": places}}))
         with pytest.warns(UserWarning, match=r"no pose of p3\.png"):
-            seen |= set(Batch(tmp_path, tmp_path, do="export", prediction=SPHERE).list_exports(house))
+            seen |= set(Batch(tmp_path, tmp_path, do="export", prediction=SPHERE).list_commands(house))
         assert len(seen) > number
 
 
@@ -180,7 +180,7 @@ def test_files_of_weights_have_whole_paths_on_workers(rooms: Path, tmp_path: Pat
 
 def test_the_export_of_a_refined_scene_is_refined(rooms: Path, tmp_path: Path, sphere: None) -> None:
     steps = {
-        do: Batch(rooms, tmp_path, do=do).list_exports(rooms / "room0") for do in ("export", "predict,refine,export")
+        do: Batch(rooms, tmp_path, do=do).list_commands(rooms / "room0") for do in ("export", "predict,refine,export")
     }
     limits = [
         {name.split("-")[0]: e.prediction.options.refine_steps for name, e in each.items()} for each in steps.values()

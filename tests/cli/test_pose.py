@@ -124,7 +124,7 @@ CALLERS = {
     "pose": lambda folder, out: run(["pose", str(folder), "-o", str(folder / "poses.json")]),
     "pose of a tour's file": lambda folder, out: run(["pose", *map(str, folder.glob("*.html"))]),
     "export": _export,
-    "predict_tour": lambda folder, out: pansplat.predict_tour(folder),
+    "pansplat.predict": lambda folder, out: pansplat.predict(folder),
     "the window": lambda folder, out: find_entries(folder, ReadOptions(), PredictOptions()),
 }
 
@@ -157,7 +157,7 @@ WITHOUT_CACHES = {
     "batch": lambda folder, out: process_item(
         ("tour", folder), Batch(folder, out, prediction=SPHERE), fingerprint_work(SPHERE)
     ),
-    "predict_tour": lambda folder, out: pansplat.predict_tour(folder, "sphere", cache=False),
+    "pansplat.predict": lambda folder, out: pansplat.predict(folder, "sphere", cache=False),
     "the window": lambda folder, out: run_viewer(
         [str(folder), "--offscreen", str(out), *QUICK, "--renderer", "cpu", "--size", "32x32", "--seconds", "0.1"]
     ),
@@ -188,11 +188,11 @@ def test_without_caches_no_file_is_written_to_them_or_read(
     for number, (name, call) in enumerate(WITHOUT_CACHES.items(), start=1):
         call(linked, out)
         assert len(calls) >= number and list_files() == before, name
-    pansplat.predict_tour(linked, "sphere")
+    pansplat.predict(linked, "sphere")
     kept, calls = list_files(), []
     kinds = {file.name.split("-")[0] for file in kept if file.suffix == ".entry"}
     assert {"poses", "overlaps", "features", "prediction"} <= kinds, "with caches there are files"
-    pansplat.predict_tour(linked, "sphere", cache=False)
+    pansplat.predict(linked, "sphere", cache=False)
     assert list_files() == kept and calls == [0], "nothing is read"
     fingerprint_work.cache_clear()
 

@@ -101,7 +101,7 @@ def parted_scene(room: Path, tmp_path: Path) -> Path:
     (pair,) = pipeline.load_sets(room)
     alone = replace(pair, context=(replace(pair.targets[0], world=1),), targets=())
     (tour,) = find_tours([replace(pair, targets=()), alone])
-    pipeline.save(pipeline.predict_tour(tour, "sphere", height=HEIGHT, cache=False), tmp_path / "tour.ply")
+    pipeline.save(pipeline.predict(tour, "sphere", height=HEIGHT, cache=False), tmp_path / "tour.ply")
     return tmp_path / "tour.ply"
 
 

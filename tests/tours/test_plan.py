@@ -284,8 +284,8 @@ def _two_storeys() -> Scene:
 def _read_svg(path: Path) -> tuple[list[np.ndarray], str]:
     """Corners of the rooms in metres, and all texts."""
     root = ElementTree.parse(path).getroot()
-    paths = [node for group in root.iter() if group.get("id", "").startswith("room") for node in group]
-    rooms = [np.array(re.findall(r"-?[\d.]+", node.get("d")), float).reshape(-1, 2) for node in paths]
+    paths = [node for node in root.iter() if node.tag.endswith("}polygon")]
+    rooms = [np.array(re.findall(r"-?[\d.]+", node.get("points")), float).reshape(-1, 2) for node in paths]
     metre = 0.02 / 0.0254 * 72
     return [room / metre for room in rooms], "\n".join(n.text for n in root.iter() if n.tag.endswith("text"))
 

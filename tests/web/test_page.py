@@ -24,7 +24,7 @@ from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
-from pansplat.export.page import write_page
+from pansplat.export.page import choose_gaussians, write_page
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
@@ -123,7 +123,9 @@ def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Sc
     facing = dataclasses.replace(house, gaussians=dataclasses.replace(gaussians, means=means))
     write_page(facing, tmp_path / "wall.html")
     turns = read_header(tmp_path / "wall.html")["spots"][0]["turns"]
-    assert abs(turns[find_bin(yaw)]) > 0.5 and turns[find_bin(yaw + math.pi)] == 0, "on arrival, too"
+    assert abs(turns[find_bins(np.array(yaw))]) > 0.5 and turns[find_bins(np.array(yaw + math.pi))] == 0, (
+        "on arrival, too"
+    )
     assert math.cos(read_start(tmp_path / "wall.html")[0] - yaw) < 0
     local = house.cam2world[0, :3, :3].numpy().T @ ahead.numpy()
     start = math.atan2(local[0], local[2]), math.asin(local[1])
@@ -240,9 +242,11 @@ def test_panoramas_of_all_parts_that_have_gaussians_keep_as_many(flat: Scene) ->
 
 
 def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
-    shares = [page_module._choose_share(count, [4096] * 5) for count in (0, 450_000)]
-    assert page_module._choose_share(450_000, [1024] * 5) == page_module._choose_share(450_000, []) == 1
-    assert shares[1] < 1
+    assert [choose_gaussians(heights) for heights in ([], [1024] * 5, [4096] * 5)] == [600_000, 450_000, 300_000]
+    assert 300_000 < choose_gaussians([2048] * 4) < 450_000
+
+
+def test_the_camera_flies_in_parts_with_a_good_edge() -> None:
     edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
     flights = page_module._Flights((0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges, ())
     assert page_module._find_flown_parts(flights, [(2, 3)]) == {0}

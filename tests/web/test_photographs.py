@@ -191,6 +191,20 @@ def test_photographs_have_the_exposure_of_their_gaussians(
         assert torch.allclose(image, (original / torch.tensor(factors)[:, None, None]).clamp(0, 1), atol=1e-6)
 
 
+def test_tiles_are_encoded_again_only_of_another_photograph_or_of_one_with_a_mask(
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoded, encode = [], module._encode
+    monkeypatch.setattr(module, "_encode", lambda *arguments: encoded.append(1) or encode(*arguments))
+    photographs = take_photographs(scene, 64)
+    first, again = pack(scene, photographs), pack(scene, photographs)
+    assert [each.make_files() for each in first] == [each.make_files() for each in again] and len(encoded) == 6 * 3
+    Image.new("RGB", (128, 64), PURPLE).save(photographs[1].context[0].image)
+    for number in (5, 6):
+        pack(scene, hide(photographs, "mask"))
+        assert len(encoded) == 6 * number, "what a mask hides is drawn by the scene"
+
+
 def test_photographs_fit_into_the_bytes_or_have_the_stated_height(
     scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
