@@ -133,7 +133,8 @@ def require_named(keys: tuple[Any, ...], message: str) -> None:
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_any_other_value_is_read_or_its_field_is_named(name: str, tmp_path: Path) -> None:
     file, rng, refused = FILES[name](tmp_path), random.Random(name), 0
-    for keys in list_parts(file.document):
+    parts = list(list_parts(file.document))
+    for keys in rng.sample(parts, min(len(parts), 120)):
         for value in ({"odd": []}, "odd", *rng.sample(VALUES, 3)):
             message = attempt(file, file.pack(change(file.document, keys, value)))
             refused += message is not None

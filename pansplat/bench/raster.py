@@ -53,6 +53,7 @@ Precision = Literal["float32", "float64"]
 
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 _MIN_REPEATS, _MAX_REPEATS = 3, 15  # images that are timed, at least, and of fast cases at most
+_MAX_REPEATED = 3.0  # seconds; a case whose first image takes longer is not repeated
 _MAX_TORCH_GAUSSIANS = 4_000_000  # the torch reference renders them in minutes
 _MAX_CHOICE_HEIGHT = 512  # rows; each layout needs a float64 reference
 _MARKERS = {"numba": "o", "torch": "s", "triton": "D"}
@@ -201,23 +202,20 @@ def _multiple_of_8(height: float) -> int:
     return max(8, 8 * round(height / 8))
 
 
-def measure_raster(groups: Iterable[Group], *, budget: float = 2.0, slow: float = 3.0) -> Iterator[Row]:
+def measure_raster(groups: Iterable[Group], *, budget: float = 2.0) -> Iterator[Row]:
     """Yield the row of each case, and yield it again after each repeat.
 
     Args:
         groups: cases, each group with its scene.
         budget: seconds for the repeats of a case.
-        slow: seconds; a case whose first image takes longer is not repeated.
     """
     exact: dict[tuple[str, RasterCase], Tensor] = {}
     for group in groups:
         with restore_threads():
-            yield from _measure_group(group, exact, budget, slow)
+            yield from _measure_group(group, exact, budget)
 
 
-def _measure_group(
-    group: Group, exact: dict[tuple[str, RasterCase], Tensor], budget: float, slow: float
-) -> Iterator[Row]:
+def _measure_group(group: Group, exact: dict[tuple[str, RasterCase], Tensor], budget: float) -> Iterator[Row]:
     """Add the exact images of the cases, render each case once, and then all in turns."""
     announce(f"{group.scene.name}: making the scene")
     scene, gaussians, cases = group.scene, group.scene.load(), list(group.cases)
@@ -242,7 +240,7 @@ def _measure_group(
             row.values |= compare_images(color, exact[scene.name, case.exact])
         seconds = [timing.wall for timing in first.values()]
         count, timings = 1, {name: [timing] for name, timing in first.items()}
-        if case.precision != "float64" and max(seconds) <= slow:
+        if case.precision != "float64" and max(seconds) <= _MAX_REPEATED:
             count = min(_MAX_REPEATS, max(_MIN_REPEATS, int(budget / sum(seconds))))
             timings = {name: [] for name in first}  # the first image may have waited for memory
         row.values |= peak | _summarise(timings)

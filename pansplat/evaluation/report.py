@@ -125,20 +125,15 @@ def _evaluate_pair(
         folder = out / make_unique_name(make_portable_name(name) or "case", taken)
         taken.add(folder.name)
         make_folder(folder)
-        write_image(folder / "prediction.png", image)
-        write_image(folder / "target.png", target)
-        write_image(folder / "error.png", error_image(image, target))
+        pictures = {"prediction": image, "target": target, "error": error_image(image, target)}
+        for title, picture in pictures.items():
+            write_image(folder / f"{title}.png", picture)
         faded = cross_fade(context.images, context.cam2world, pose)
         mask = None if bool(targets.masks[view].all()) else targets.masks[view]
         faded_values = measure_image(faded, target, lpips, mask)
         yield Row(
-            {
-                "name": folder.name,
-                "model": predictor.name,
-                "height": height,
-                "prediction": str((folder / "prediction.png").resolve()),
-                "target": str((folder / "target.png").resolve()),
-            },
+            {"name": folder.name, "model": predictor.name, "height": height}
+            | {title: str((folder / f"{title}.png").resolve()) for title in ("prediction", "target")},
             {
                 **measure_image(image, target, lpips, mask),
                 **{new: faded_values[old] for old, new in _CROSS_FADE.items() if old in faded_values},

@@ -18,6 +18,7 @@ import unicodedata
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -77,7 +78,7 @@ class PackedPhotograph:
     tiles: tuple[bytes, ...]
     rotation: Float[np.ndarray, "3 3"]
 
-    @property
+    @cached_property
     def name(self) -> str:
         """The label, and hexadecimal digits that change with the content."""
         return f"{self.label}_{hashlib.blake2b(b''.join(self.tiles), digest_size=8).hexdigest()}"

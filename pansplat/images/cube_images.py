@@ -17,7 +17,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -122,19 +122,11 @@ def write_cube(cube: CubeImage, folder: Path, name: str) -> Path:
     return write_description(dataclasses.replace(cube, folder=cube.folder.resolve()), folder, name + CUBE_SUFFIX)
 
 
-class Assembled(Protocol):
-    """A panorama that is made from pictures: a dataclass, whose fields are the content of the file for it."""
-
-    def list_files(self) -> Iterator[Path]:
-        """The files of all pictures."""
-        ...
-
-
-def write_description(panorama: Assembled, folder: Path, name: str) -> Path:
+def write_description(panorama: Any, folder: Path, name: str) -> Path:
     """Write a file that stands for a panorama, if it has changed; it changes with every picture's time or size.
 
     Args:
-        panorama: all of its paths are whole.
+        panorama: a dataclass of whole paths, whose `list_files` are the pictures; its fields are the content.
         folder: the tour's; the file is written in its cache folder.
         name: valid as a file name. The file is in a folder of its content: tours of one folder may have equal names.
     """

@@ -27,7 +27,7 @@ from pansplat.images.cube_images import DENSITY, LARGEST_DENSITY, Decode, equire
 
 RIG_SUFFIX = ".rig.json"
 
-_Row = tuple[float, float, float]
+_Row = Annotated[tuple[float, ...], Meta(min_length=3, max_length=3)]
 _SAMPLES = 2  # samples per pixel and axis
 _CUBE_TOLERANCE = 1e-4  # deviation of a cube's faces: radians, and relative to half a face
 _EDGE_MARGIN = 0.5  # pixels outside a picture that count as covered, because of rounding at common edges
@@ -68,7 +68,7 @@ class RigView:
     """
 
     file: Path
-    rotation: tuple[_Row, _Row, _Row]
+    rotation: Annotated[tuple[_Row, ...], Meta(min_length=3, max_length=3)]
     lens: Lens
     mask: Path | None = None
 

@@ -90,9 +90,9 @@ def image_planes(
 
     Args:
         size: height and width of the whole image, pixels.
-        vertical_fov_degrees: of a pinhole image.
-        face_size: of cube faces, pixels; by default with the panorama's resolution at the equator.
-        eye_offset: of layout "equirect", see `ImagePlane`.
+        vertical_fov_degrees: vertical field of view of a pinhole image.
+        face_size: side of cube faces, pixels; by default with the panorama's resolution at the equator.
+        eye_offset: eye offset of layout "equirect", see `ImagePlane`.
     """
     upright = torch.eye(3, dtype=torch.float64, device=device)
     if layout == "equirect":

@@ -39,8 +39,8 @@ def rasterize_official(
     Args:
         cam2world: pose of the camera, OpenCV axes, metres.
         size: height, a multiple of 4, and width of the panorama, pixels.
-        near: of the prediction, metres; Gaussians nearer than a fifth of it are not rasterised. The official code
-            compares the depth along a face's axis with it instead.
+        near: near bound of the prediction, metres; Gaussians nearer than a fifth of it are not rasterised. The
+            official code compares the depth along a face's axis with it instead.
         backend: see `rasterize`.
     """
     return rasterize(

@@ -66,7 +66,7 @@ class ProjectedGaussians(NamedTuple):
         covariance: C' of docs/rendering.md, camera axes, float64.
         peak: opacity after the filter's compensation.
         values: colour (RGB) seen from the camera, then the distance; compositing averages both along a ray.
-        rows: a, b, l of the exact kernel; none for `ewa`, which computes them for each image plane.
+        rows: rows a, b, l of the exact kernel; none for `ewa`, which computes them for each image plane.
         radial_variance: S', the variance along the ray.
     """
 
@@ -149,7 +149,7 @@ class _Shape(NamedTuple):
     Attributes:
         covariance: C, camera axes.
         in_frame: C in the tangent frame u, v, n.
-        det_across, trace_across: of B, the block across the ray.
+        det_across, trace_across: determinant and trace of B, the block across the ray.
         radial_variance: g, the variance along the ray.
         mixed: M = g tr B - |c|^2.
         det: det C.

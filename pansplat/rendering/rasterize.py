@@ -128,9 +128,9 @@ def rasterize(
         cam2world: rigid pose, metres; differentiable.
         size: height and width of the image, pixels.
         layout: "equirect" has one ray for each pixel; "cubemap" stitches a panorama from six faces; "pinhole".
-        vertical_fov_degrees: of a pinhole image.
-        face_size: of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
-        eye_offset: of layout "equirect": radius of the viewing circle of omni-directional stereo, metres, half the
+        vertical_fov_degrees: vertical field of view of a pinhole image.
+        face_size: side of a cubemap's faces, pixels; by default with the panorama's resolution at the equator.
+        eye_offset: in layout "equirect", radius of the viewing circle of omni-directional stereo, metres, half the
             distance of the eyes. Positive for the right eye, negative for the left. The gradients are those of "torch".
         background: one number for each channel; the default is black for any number of channels.
         backend: "torch" is the reference, "numba" fast on a CPU (kernel "ray", three channels), "triton" on CUDA;

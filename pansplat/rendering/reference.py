@@ -45,8 +45,8 @@ class TileIntersections:
 
     Attributes:
         tiles: index of the first tile, and one past the last, in the image's row-major order of tiles.
-        indices: of the Gaussians, tile after tile.
-        starts: of each tile in `indices`, and the end of the last.
+        indices: indices of the Gaussians, tile after tile.
+        starts: start of each tile in `indices`, and the end of the last tile.
     """
 
     tiles: tuple[int, int]

@@ -25,7 +25,7 @@ MAX_DIGITS = 18  # largest length of a whole number, which then fits 64 bits
 _QUOTED = 60  # part of a wrong value that a message quotes
 _TYPE_WORDS = {
     "int": "a whole number", "float": "a number", "str": "a text", "bool": "true or false", "array": "a list",
-    "object": "an object {...}", "Tensor": "a tensor",
+    "object": "an object {...}", "Tensor": "a tensor", "Path": "a text",
 }  # fmt: skip
 
 
@@ -101,7 +101,7 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
         strict: whether a text is no number.
     """
     try:
-        return msgspec.convert(value, kind, strict=strict, dec_hook=lambda kind, content: kind(content))  # a Path
+        return msgspec.convert(value, kind, strict=strict, dec_hook=_make_path)
     except UnicodeEncodeError as error:
         raise InputError(f"{source}: needed valid Unicode, got {error.object!a:.{_QUOTED}}; correct it.") from error
     except msgspec.ValidationError as error:
@@ -120,6 +120,11 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
         problem = re.sub(", got .*", "", problem).replace("Expected", "needed")
         problem = re.sub("^(Invalid|Number).*", "needed a known value", problem)
         raise InputError(f"{where}: {problem}, got {value!r:.{_QUOTED}}; correct it.") from error
+
+
+def _make_path(kind: type, content: Any) -> Any:
+    """The path of a text; other types that msgspec does not know, such as tensors, stay what they are."""
+    return kind(content) if kind is Path and isinstance(content, str) else content
 
 
 def read_field(content: Mapping[str, Any], key: str, kind: Any, source: object, default: Any = None) -> Any:

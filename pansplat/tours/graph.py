@@ -112,13 +112,9 @@ class TourGraph:
     @cached_property
     def approximate(self) -> dict[int, tuple[int, ApproximatePlace]]:
         """The nodes that are not placed, but about a node beside them, and where, as the files of the tour state it."""
-        number, found = {panorama.image: node for node, panorama in enumerate(self.panoramas)}, {}
-        for node, panorama in enumerate(self.panoramas):
-            about = panorama.placement.about
-            beside = None if about is None or self.is_placed(node) else number.get(about.beside)
-            if about is not None and beside is not None and self.panoramas[beside].placement.about is None:
-                found[node] = beside, about
-        return found
+        number = {view.image: node for node, view in enumerate(self.panoramas) if view.placement.about is None}
+        stated = ((node, view.placement.about) for node, view in enumerate(self.panoramas) if not self.is_placed(node))
+        return {node: (number[about.beside], about) for node, about in stated if about and about.beside in number}
 
     def with_walls(self, walls: Iterable[Edge]) -> TourGraph:
         """The graph with further walls in place of edges; a node without another edge gets a self-edge."""

@@ -30,8 +30,7 @@ def lay_out(panoramas: Sequence[Panorama]) -> tuple[Panorama, ...]:
     members: dict[int, list[int]] = {}
     for node, panorama in enumerate(panoramas):
         members.setdefault(panorama.world, []).append(node)
-    order = sorted(members, key=lambda world: -len(members[world]))[:1]
-    order += [world for world in members if world not in order]
+    order = [*dict.fromkeys((max(members, key=lambda world: len(members[world])), *members))]
     poses = [torch.stack([panoramas[node].cam2world for node in members[world]]).double() for world in order]
     levels = [level_pose(group[0], up_direction(group))[:3, :3] for group in poses]
     places = [(group[:, :3, 3] @ level).numpy() for group, level in zip(poses, levels, strict=True)]

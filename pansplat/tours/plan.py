@@ -203,7 +203,7 @@ def make_plan(
         normals = _find_directions(in_part, unit) if in_part else np.eye(2)
         found = [(*room, True) for room in _outline_rooms(sights, members, normals, unit)] if members else []
         free = {k for k in range(count) if (parts[k], storeys[k]) == (part, storey)}.difference(*(n for n, *_ in found))
-        for view in sorted(free):
+        for view in sorted(free):  # those in a room come last in it
             point = shapely.Point(surfaces[view].center[[0, 2]])
             inside = [n for n, (_, outline, _) in enumerate(found) if Polygon(outline).contains(point)]
             beside = shapely.union_all([Polygon(outline) for _, outline, _ in found])
@@ -237,7 +237,7 @@ def _enclose(
     free = _clean(box.difference(beside).buffer(0), unit)
     pieces = [piece for piece in shapely.get_parts(free) if piece.area > _LEAST_PIECE * unit**2]
     piece = min(pieces, key=lambda piece: piece.distance(shapely.Point(center)), default=None)
-    return None if piece is None else np.array(shapely.orient_polygons(piece).exterior.coords)[:-1]
+    return None if piece is None else _list_corners(piece)
 
 
 def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
@@ -463,21 +463,15 @@ def _join(
 def _outline_rooms(
     sights: Sequence[_Sight | None], members: Sequence[int], normals: Float[np.ndarray, "direction 2"], unit: float
 ) -> list[tuple[tuple[int, ...], Outline]]:
-    """The panoramas and outlines of the rooms of a storey; those whose own walls are open come last in their room."""
+    """The rooms of a storey: the panoramas whose own walls are closed, and outlines."""
     seen = {k: sights[k] for k in members}
     alone = {k: _trace_outline(sight, _find_lines([sight], normals, unit), unit) for k, sight in seen.items()}
     traced = [k for k in members if alone[k] is not None and alone[k].area > _LEAST_AREA * unit**2]
-    points = {k: shapely.Point(seen[k].center) for k in traced}
-    mutual = [
-        (a, b)
-        for a, b in itertools.product(range(len(traced)), repeat=2)
-        if alone[traced[a]].contains(points[traced[b]]) and alone[traced[b]].contains(points[traced[a]])
-    ]
-    if not mutual:
-        return []
+    inside = {k: _list_inside(traced, seen, alone[k]) for k in traced}
+    mutual = [(traced.index(a), traced.index(b)) for a in traced for b in inside[a] if a in inside[b]]
     labels = np.array(label_components(len(traced), mutual))
     shapes: list[tuple[tuple[int, ...], shapely.Geometry]] = []
-    for label in range(labels.max() + 1):
+    for label in np.unique(labels):
         nodes = tuple(traced[k] for k in np.flatnonzero(labels == label))
         lines = _find_lines([seen[k] for k in nodes], normals, unit)
         outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]
@@ -487,12 +481,12 @@ def _outline_rooms(
     ]
     pieces = [(_list_inside(nodes, seen, piece), piece) for nodes, piece in pieces]
     pieces = [(nodes, piece) for nodes, piece in pieces if nodes and piece.area > _LEAST_AREA * unit**2]
-    free, rooms = set(members) - {node for nodes, _ in pieces for node in nodes}, []
-    for nodes, piece in pieces:
-        ring = shapely.normalize(piece).exterior
-        corners = np.array((ring if ring.is_ccw else ring.reverse()).coords)[:-1]
-        rooms.append((nodes + _list_inside(sorted(free), seen, piece), corners))
-    return rooms
+    return [(nodes, _list_corners(shapely.normalize(piece))) for nodes, piece in pieces]
+
+
+def _list_corners(shape: Polygon) -> Outline:
+    """The corners of a shape, anticlockwise."""
+    return np.array(shapely.orient_polygons(shape).exterior.coords)[:-1]
 
 
 def _list_inside(nodes: Iterable[int], sights: dict[int, _Sight], shape: shapely.Geometry) -> tuple[int, ...]:

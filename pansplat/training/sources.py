@@ -40,9 +40,13 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class PairSource:
-    """Pairs with targets; each is a sample. Files are read by `sample`."""
+    """Pairs with targets; each is a sample with one of its targets. Files are read by `sample`.
 
-    pairs: Sequence[PanoramaSet]
+    Attributes:
+        pairs: pairs, or triplets on disk: a scene folder of PanoGRF, or a .json file of a game map, for each.
+    """
+
+    pairs: Sequence[PanoramaSet | Path]
 
     def __post_init__(self) -> None:
         if not self.pairs:
@@ -52,38 +56,19 @@ class PairSource:
         return len(self.pairs)
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
-        return _read_pair(self.pairs[index], height, seed)
+        pair = self.pairs[index]
+        pair = _read_triplet(pair) if isinstance(pair, Path) else pair
+        target = pair.targets[np.random.default_rng(seed).integers(len(pair.targets))]
+        targets = dataclasses.replace(pair, targets=(target,)).load_targets(height)
+        return Sample(pair.name, pair.load_context(height), targets)
 
 
-@dataclass(frozen=True)
-class TripletSource:
-    """Triplets on disk, in PanoGRF's format or that of game maps; each is a sample.
-
-    Attributes:
-        sources: a scene folder or .json file per triplet.
-    """
-
-    sources: tuple[Path, ...]
-
-    def __len__(self) -> int:
-        return len(self.sources)
-
-    def sample(self, index: int, height: int, seed: int) -> Sample:
-        source = self.sources[index]
-        is_triplet = source.is_file()
-        collection = read_triplet(source, source.parent) if is_triplet else read_panogrf_scene(source, source)
-        (pair,) = collection.sets()
-        if not pair.targets:
-            raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
-        return _read_pair(dataclasses.replace(pair, siblings=()), height, seed)  # without detection of static content
-
-
-def _read_pair(pair: PanoramaSet, height: int, seed: int) -> Sample:
-    """The sample of a pair with one of its targets."""
-    target = pair.targets[np.random.default_rng(seed).integers(len(pair.targets))]
-    return Sample(
-        pair.name, pair.load_context(height), dataclasses.replace(pair, targets=(target,)).load_targets(height)
-    )
+def _read_triplet(source: Path) -> PanoramaSet:
+    collection = read_triplet(source, source.parent) if source.is_file() else read_panogrf_scene(source, source)
+    (pair,) = collection.sets()
+    if not pair.targets:
+        raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
+    return dataclasses.replace(pair, siblings=())  # static content is not detected
 
 
 @dataclass(frozen=True)
@@ -121,7 +106,7 @@ class FixedFramePairs:
         return read_frame_pair(*self.pairs[index], height)
 
 
-def read_panogrf(root: Path | str, stage: Stage, height: int) -> TripletSource:
+def read_panogrf(root: Path | str, stage: Stage, height: int) -> PairSource:
     """PanoGRF's triplets of Matterport3D, 0.5 m between views. Source: docs/official.md, section 2.1.
 
     Args:
@@ -138,18 +123,18 @@ def read_panogrf(root: Path | str, stage: Stage, height: int) -> TripletSource:
             f"{root}: needed PanoGRF scenes for {stage}, got none in {folder}; give the folder that holds it, or "
             "download it."
         )
-    return TripletSource(tuple(scenes))
+    return PairSource(scenes)
 
 
-def read_game_maps(folder: Path | str) -> TripletSource:
+def read_game_maps(folder: Path | str) -> PairSource:
     """The game-map triplets (NAME.json) of a folder."""
     folder = expand_home(folder)
-    sources = tuple(find_triplets(folder))
+    sources = find_triplets(folder)
     if not sources:
         raise InputError(
             f"{folder}: needed triplets (NAME.json with NAME_0.png next to it), got none; see docs/input.md."
         )
-    return TripletSource(sources)
+    return PairSource(sources)
 
 
 def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSource, SampleSource]:

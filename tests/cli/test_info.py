@@ -27,7 +27,8 @@ def test_info_says_what_runs_where(
 
 
 @pytest.mark.shared
-def test_check_exits_with_1_if_the_convention_is_wrong(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_exits_with_1_if_the_convention_is_wrong(shared: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("pansplat.evaluation.pose_check._HEIGHT", 40)
     pair = str(shared / "data" / "mp3d_sample")
     assert run(["check", pair]) == 0
     assert "as given" in capsys.readouterr().out

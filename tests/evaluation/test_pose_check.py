@@ -22,7 +22,7 @@ from pansplat.inputs.folders import load_sets
 from pansplat.inputs.views import Views
 
 _FLIP = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
-_HEIGHT = 64
+_HEIGHT = 40
 
 
 def _pose(quat: tuple[float, ...], centre: tuple[float, ...]) -> torch.Tensor:

@@ -78,14 +78,6 @@ def test_a_translucent_edge_over_an_opaque_view_shows_no_background(background, 
     assert torch.equal(got.alpha, torch.ones(2, 3))
 
 
-def test_views_of_equal_alpha_keep_it():
-    background = (0.2, 0.9, 0.4)
-    first, second = (_image(color, 0.3, background=background) for color in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
-    got = blend([first, second], torch.tensor((0.25, 0.75)))
-    assert torch.allclose(got.color, 0.25 * first.color + 0.75 * second.color)
-    assert torch.allclose(got.alpha, first.alpha)
-
-
 @_COUNTS
 def test_at_an_input_position_only_its_view_counts_and_the_weights_have_no_gradient(count):
     images = _draw(count)

@@ -78,6 +78,10 @@ def list_cases() -> Iterator[tuple[str, Case]]:
             (make_spheres([(0, 0, distance), (0, 0.4, 2.0)], 0.2), {"near": 0.5, "fields": NO_QUATS}),
         )
 
+    for depth in (0.3, 0.08, 0.5):  # the official code's bound is a fifth of `near`, along a face's axis
+        two = make_spheres([(0, 0, depth), (0, 0.4, 2.0)], 0.05)
+        yield f"near, ewa {depth}", (two, {"near": 0.45, "layout": "cubemap", "kernel": "ewa", "fields": NO_QUATS})
+
     # Order
     pair = make_spheres([(0.4, 0.1, 2.0)] * 2, 0.4, colours=RED_GREEN)
     ties = Gaussians.cat([pair, make_scene(9, degree=0), pair.select(torch.tensor([1, 0, 0]))])

@@ -9,9 +9,7 @@ from refusals import expect_error
 from torch._dynamo.utils import counters
 
 from pansplat.bench.scenes import full_lattice_room
-from pansplat.gaussians.scene import Gaussians
 from pansplat.rendering import rasterize
-from pansplat.rendering.rasterize import RasterOptions
 
 _ORIGIN = torch.eye(4, dtype=torch.float64)
 
@@ -45,14 +43,6 @@ def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
         rasterize(scene, pose, size=(4, 8), sharpness=2)
 
 
-def test_keywords_are_the_fields_of_the_options(make_scene, pose):
-    scene, place = make_scene(20), dict(size=(16, 32), layout="cubemap", face_size=8)
-    plain = rasterize(scene, pose, **place).color
-    for options in (RasterOptions(), RasterOptions("ewa"), RasterOptions(near=1.0)):
-        is_plain = torch.equal(rasterize(scene, pose, **place, **vars(options)).color, plain)
-        assert is_plain == (options == RasterOptions()), options
-
-
 # --- channels ---
 
 
@@ -67,31 +57,21 @@ def test_the_default_background_is_black_for_any_number_of_channels(make_scene, 
 # --- torch.compile ---
 
 
-def _loss(gaussians: Gaussians, backend: str) -> torch.Tensor:
-    moved = dataclasses.replace(gaussians, means=gaussians.means * 1.01, scales=gaussians.scales.log().exp())
-    got = rasterize(moved, _ORIGIN, size=(16, 32), backend=backend)
-    return got.color.square().sum() + 0.1 * got.depth.sum() + got.alpha.sum()
-
-
-def _gradients(loss, gaussians: Gaussians, backend: str):
-    leaves = {name: getattr(gaussians, name).clone().requires_grad_() for name in ("means", "scales", "opacities")}
-    value = loss(dataclasses.replace(gaussians, **leaves), backend)
-    return value.detach(), torch.autograd.grad(value, list(leaves.values()))
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # the compiler reads it
-@pytest.mark.parametrize("backend", ["numba", "torch"])
-def test_a_compiled_step_has_the_same_loss_and_gradients_without_tracing_the_rasteriser(backend):
-    gaussians = full_lattice_room(16)
+def test_a_compiled_step_has_the_same_gradients_without_tracing_the_rasteriser():
+    gaussians, results = full_lattice_room(16), []
+
+    def loss(means: torch.Tensor) -> torch.Tensor:
+        moved = dataclasses.replace(gaussians, means=means * 1.01)
+        return rasterize(moved, _ORIGIN, size=(16, 32), backend="numba").color.square().sum()
+
     torch._dynamo.reset()
     counters.clear()
-    value, gradients = _gradients(torch.compile(_loss, backend="aot_eager"), gaussians, backend)
-    plain, expected = _gradients(_loss, gaussians, backend)
-    assert torch.allclose(value, plain, rtol=1e-6)
-    for found, right in zip(gradients, expected, strict=True):
-        assert torch.allclose(found, right, rtol=1e-5, atol=1e-6 * right.abs().max())
-    assert counters["frames"]["total"] > 0
+    for step in (loss, torch.compile(loss, backend="aot_eager")):
+        means = gaussians.means.clone().requires_grad_()
+        results += torch.autograd.grad(step(means), means)
+    torch.testing.assert_close(*results, rtol=1e-5, atol=1e-6 * float(results[0].abs().max()))
     assert any("torch.compiler.disable" in reason for reason in counters["graph_break"])
     assert sum(counters["graph_break"].values()) <= 4  # around `rasterize`; tracing it gives dozens

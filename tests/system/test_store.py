@@ -14,6 +14,7 @@ import torch
 
 from pansplat.errors import InputWarning
 from pansplat.system import store
+from pansplat.system.atomic import replacing
 from pansplat.system.store import Store, hash_file, hash_parts
 
 
@@ -149,15 +150,15 @@ def test_the_entries_that_were_used_least_recently_are_removed_above_the_limit_a
 
 
 def test_unfinished_files_of_killed_processes_are_removed(folder: Path) -> None:
-    code = (
-        "import os, sys\nfrom pansplat.system.atomic import replacing\n"
-        "with replacing(sys.argv[1]) as file:\n    file.write_bytes(b'half')\n    os.kill(os.getpid(), 9)\n"
-    )
-    cache = folder / ".pansplat"
+    cache, unfinished = folder / ".pansplat", []
     cache.mkdir()
     for name in ("old.entry", "new.entry"):
-        subprocess.run([sys.executable, "-c", code, cache / name], check=False)
-    old, new = (next(cache.glob(f".{name}.*.entry")) for name in ("old", "new"))
+        with pytest.raises(KeyboardInterrupt), replacing(cache / name) as file:
+            unfinished.append(file)
+            raise KeyboardInterrupt
+    old, new = unfinished
+    for file in unfinished:
+        file.write_bytes(b"half")  # as if the process had been killed
     os.utime(old, (1e9, 1e9))
     Store(folder).write("view", "key", 1)
     assert set(cache.iterdir()) == {new, *Store(folder).find("view", "key")}

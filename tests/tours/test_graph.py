@@ -9,17 +9,13 @@ import pytest
 import torch
 from synthetic_scenes import make_balls
 
-from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
+from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.graph import find_tours
 from pansplat.tours.limits import follow_edge
 from pansplat.tours.merge import describe_tour, make_graph
 from pansplat.tours.scene_views import choose_scene_views, choose_sources, leave_out
 from pansplat.tours.walks import find_walk, plan_walk
-
-
-def make_gaussians(count: int) -> Gaussians:
-    return make_balls(torch.ones(count, 3), 1.0, 1.0)
 
 
 def test_pairs_that_share_panoramas_are_one_tour(make_tour):
@@ -94,8 +90,7 @@ def test_worlds_are_level_and_far_apart(home):
     (place, _), poses = pair.context, torch.stack([panorama.cam2world for panorama in pair.context])
     assert np.allclose(place.cam2world[:3, 3], (5, 5, 0)), "scenes are predicted in their own world"
     means = poses[:, :3, 3].float() + place.cam2world[:3, 2].float()  # 1 m ahead
-    gaussians = dataclasses.replace(make_gaussians(2), means=means)
-    scene = home.place(Scene(gaussians, poses, 1.0, 2.0), (4, 5))
+    scene = home.place(Scene(make_balls(means, 1.0), poses, 1.0, 2.0), (4, 5))
     assert np.allclose(scene.cam2world, home.cam2world[4:6]), "and placed in that of the tour"
     assert np.allclose(scene.gaussians.means, home.positions[4:6] + np.array((0, 0, 1)), atol=1e-5)
     for node, place in enumerate(home.positions):

@@ -7,15 +7,11 @@ import numpy as np
 import torch
 from synthetic_scenes import make_balls
 
-from pansplat.gaussians.scene import Gaussians, Scene, SceneTour, empty_gaussians
+from pansplat.gaussians.scene import Scene, SceneTour, empty_gaussians
 from pansplat.inputs.placements import ApproximatePlace, Placement
 from pansplat.tours.linked_rooms import find_stated_place
 from pansplat.tours.merge import make_graph, merge_scenes, select_views
 from pansplat.tours.scene_views import choose_sources
-
-
-def make_gaussians(count: int) -> Gaussians:
-    return make_balls(torch.ones(count, 3), 1.0, 1.0)
 
 
 def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_overlap(make_tour):
@@ -31,7 +27,7 @@ def test_one_scene_of_all_panoramas_takes_each_from_the_scene_of_the_largest_ove
         count = 10 * len(views)
         labels = torch.arange(count) % len(views)
         means = torch.tensor(views)[labels, None].float().expand(count, 3)
-        gaussians = dataclasses.replace(make_gaussians(count), means=means, views=labels.byte())
+        gaussians = make_balls(means, 1.0, views=labels.byte())
         return Scene(gaussians, tour.cam2world[list(views)], 1.0, 2.0)
 
     scene = merge_scenes(tour, load)

@@ -12,10 +12,10 @@ from pansplat.errors import InputError
 from pansplat.images.image_files import write_image
 from pansplat.inputs.views import Batch
 from pansplat.training.loader import Loader
-from pansplat.training.sources import TripletSource, read_game_maps
+from pansplat.training.sources import PairSource, read_game_maps
 
 
-def _triplets(folder: Path, count: int) -> TripletSource:
+def _triplets(folder: Path, count: int) -> PairSource:
     for k in range(count):
         for i in range(3):
             write_image(folder / f"{k}_{i}.png", torch.full((3, 8, 16), (3 * k + i) / 40))
@@ -88,5 +88,5 @@ def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) ->
 
 
 def test_empty_sources_and_batches_are_refused(tmp_path: Path) -> None:
-    expect_error("empty source", lambda: Loader(TripletSource(()), height=8, batch_size=1))
+    expect_error("empty source", lambda: Loader([], height=8, batch_size=1))
     expect_error("batch_size >= 1", lambda: Loader(_triplets(tmp_path, 1), height=8, batch_size=0))

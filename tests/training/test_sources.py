@@ -13,12 +13,12 @@ from refusals import expect_error
 from pansplat.inputs.folders import load_sets
 from pansplat.inputs.views import collate
 from pansplat.training.config import DataConfig
-from pansplat.training.sources import PairSource, TripletSource, load_sources, read_game_maps, read_panogrf
+from pansplat.training.sources import PairSource, load_sources, read_game_maps, read_panogrf
 
 
 @pytest.fixture
-def write_triplets(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., TripletSource]:
-    def write(folder: Path, *names: str) -> TripletSource:
+def write_triplets(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., PairSource]:
+    def write(folder: Path, *names: str) -> PairSource:
         for name in names:
             for i in range(3):
                 write_panorama(folder / f"{name}_{i}.png", 0.2 * (i + 1))
@@ -87,7 +87,6 @@ def test_pairs_need_targets_and_a_random_one_is_chosen(
 @pytest.mark.shared
 def test_a_folder_of_triplets_is_read_as_triplets_and_as_pairs(shared: Path) -> None:
     root = shared / "data" / "bsp_demo"
-    for source in load_sources(DataConfig("triplets", root), 64, 0):
-        assert isinstance(source, TripletSource) and len(source) == 12
-    for source in load_sources(DataConfig("pairs", root), 64, 0):
-        assert isinstance(source, PairSource) and len(source) == 12
+    for kind in ("triplets", "pairs"):
+        for source in load_sources(DataConfig(kind, root), 64, 0):
+            assert isinstance(source, PairSource) and len(source) == 12

@@ -273,7 +273,7 @@ def backpropagate_projection(
     Args:
         cam2world: float64.
         fields: means, opacities, harmonics, quats, scales.
-        grads: of the projected Gaussians.
+        grads: gradients of the projected Gaussians.
         filter_variance, exact: see `pansplat.rendering.projection.project_gaussians`.
     """
     means, opacities, harmonics, quats, scales = fields

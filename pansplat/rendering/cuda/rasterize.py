@@ -130,7 +130,7 @@ def evaluate_rows(record, centre, offsets, AXES: tl.constexpr):
     """Compute the pixels relative to a footprint's point, and the values of its rows there.
 
     Args:
-        centre: of the tile, and the residual of its rounding.
+        centre: the tile's centre, and the residual of its rounding.
         offsets: pixels relative to the centre.
     """
     delta = ()
@@ -234,9 +234,9 @@ def rasterize(
     """Composite the tiles of `intersections` into `sums`.
 
     Args:
-        intersections: of one band of tile rows.
-        pixels: of all planes.
-        sums: of all planes; the tiles' pixels are overwritten.
+        intersections: intersections of one band of tile rows.
+        pixels: pixels of all planes.
+        sums: sums of all planes; the tiles' pixels are overwritten.
 
     Returns:
         For each tile, the position in `record_ids` at which it stopped.
@@ -392,11 +392,11 @@ def rasterize_backward(
     """Add the gradients from the tiles of `intersections` to each instance's total.
 
     Args:
-        intersections: of one band of tile rows.
-        stops: of each tile, see `rasterize`.
-        pixels: of all planes.
+        intersections: intersections of one band of tile rows.
+        stops: stop of each tile, see `rasterize`.
+        pixels: pixels of all planes.
         sums: result of forward, all planes.
-        totals: of all instances.
+        totals: totals of all instances.
     """
     tiles, num = len(intersections.starts) - 1, layout.gradient_size
     fields = triton.next_power_of_2(num)

@@ -51,9 +51,9 @@ class TileIntersections:
     Attributes:
         rows: first row of tiles, and one past the last.
         record_ids: indices of records, tile after tile.
-        starts: of each tile in `record_ids`, and the end of the last.
+        starts: start of each tile in `record_ids`, and the end of the last tile.
         slots: position of each intersection before the sort by tile; those of an instance are adjacent.
-        ends: of each instance's slots.
+        ends: end of each instance's slots.
     """
 
     rows: tuple[int, int]
@@ -164,7 +164,7 @@ class TilePixels:
     """Pixels of all planes by tile, relative to the tile's centre; tiles are row by row.
 
     Attributes:
-        centres: of the tiles, rounded to the kernels' type, and the residual of the rounding.
+        centres: centres of the tiles, rounded to the kernels' type, and the residual of the rounding.
         offsets: pixel minus centre.
     """
 
