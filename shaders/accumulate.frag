@@ -1,6 +1,6 @@
 // One weighted layer at one pixel. Blending adds the layers up, and keeps the largest alpha.
-// LAYER_STORAGE (layers.py): 0 one image of the same size, 1 cube faces read by a pinhole camera, 2 cube faces read by
-// a panorama. A compile-time constant, because software OpenGL executes both sides of a branch.
+// LAYER_STORAGE: 0 one image of the same size, 1 cube faces. A compile-time constant, because software OpenGL executes
+// both sides of a branch.
 #if LAYER_STORAGE != 0
 #include "faces.glsl"
 #endif
@@ -10,7 +10,7 @@ uniform sampler2D layer_depth;
 uniform bool with_depth;
 uniform float weight;
 uniform vec2 size;              // of the output, pixels
-uniform float focal;            // pixels, storage 1
+uniform float focal;            // pixels
 uniform mat3 camera_to_faces;
 
 layout(location = 0) out vec4 out_color;    // weight x premultiplied colour, alpha
@@ -23,18 +23,9 @@ void main() {
     float depth = with_depth ? texelFetch(layer_depth, texel, 0).r : 0.0;
 #else
     vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
-#if LAYER_STORAGE == 1
     vec2 uv = atlas_uv(camera_to_faces * vec3((pixel - 0.5 * size) / focal, 1.0));
     vec4 value = textureLod(layer_color, uv, 0.0);
     float depth = with_depth ? textureLod(layer_depth, uv, 0.0).r : 0.0;
-#else
-    const float PI = 3.14159265358979;
-    float longitude = (2.0 * pixel.x / size.x - 1.0) * PI;
-    float latitude = (pixel.y / size.y - 0.5) * PI;
-    vec3 ray = vec3(cos(latitude) * sin(longitude), sin(latitude), cos(latitude) * cos(longitude));
-    vec4 value = sample_faces(layer_color, camera_to_faces * ray);
-    float depth = with_depth ? sample_faces(layer_depth, camera_to_faces * ray).r : 0.0;
-#endif
 #endif
     out_color = vec4(weight * value.rgb, value.a);
     out_depth = vec4(weight * vec2(depth, value.a), 0.0, 0.0);

@@ -17,7 +17,7 @@ from pansplat.system.devices import Device, use_device
 from pansplat.system.files import expand_home, require_output_folder, require_replaceable
 from pansplat.system.options import check_numbers
 from pansplat.system.progress import stage
-from pansplat_viewer.scene.loader import (
+from pansplat_viewer.core.loader import (
     LoadedScene,
     SceneEntry,
     SceneLoader,
@@ -26,17 +26,17 @@ from pansplat_viewer.scene.loader import (
     find_entries,
     load_entry,
 )
-from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
+from pansplat_viewer.core.settings import DrawSettings, RendererChoice
 
 if TYPE_CHECKING:
     import moderngl
 
     from pansplat.tours.camera_path import CameraPath
 
-_WRITTEN = "view_*.png", "panorama_*.png", "[0-9]*_*.png", "flythrough.mp4", "tour.mp4"  # offscreen
+_WRITTEN = "[0-9]*_*.png", "film.mp4"  # the files of --offscreen
 _WINDOW_SIZE, _FILM_SIZE = (1280, 720), (1920, 1080)  # pixels
 _SETTINGS = DrawSettings(mode="deferred")
-_PREDICTION_PART = 0.6  # of the work of a film; the rest is drawing
+_PREDICTION_PART = 0.6  # share of the prediction in the progress of a film; the rest is drawing
 _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics card is reset
 
 
@@ -44,13 +44,13 @@ _MAX_CONTEXTS = 3  # windows that are opened one after the other if the graphics
 class Options:
     """Fly through the scene of one or more 360-degree panoramas.
 
-    Opens a window. Without a display, writes a film, stills and a panorama.
+    Opens a window. Without a display, writes a film and stills.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
     """A panorama, a folder of panoramas (a tour), a folder of such folders, or a scene file."""
     offscreen: Path | None = None
-    """Open no window; write film, stills and panorama to this folder."""
+    """Open no window; write film and stills to this folder."""
     path_file: Annotated[Path | None, tyro.conf.arg(name="path")] = None
     """A camera path (docs/viewer.md), whose key frames the window has; `pansplat render` draws its film."""
     overwrite: bool = False
@@ -62,8 +62,6 @@ class Options:
     renderer: RendererChoice = "auto"
     """Draw with OpenGL (gl) or on the processor (cpu); auto is gl on a GPU, and cpu where OpenGL is
     software."""
-    at: Annotated[float, Meta(ge=0, le=1)] | None = None
-    """Start position between the panoramas, 0 to 1 (0); offscreen, position of the panorama (0.5)."""
     device: Device = "auto"
     """As that of `pansplat predict`; OpenGL draws on its own card (--renderer)."""
     verbose: bool = False
@@ -71,7 +69,7 @@ class Options:
     size: str | None = None
     """Width x height, pixels (window 1280x720, film 1920x1080)."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Length of the film (4); of a tour, by default that of the ways through all panoramas."""
+    """Length of the film; by default that of the ways through all panoramas."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of the film."""
 
@@ -114,11 +112,11 @@ def _run(options: Options) -> int:
         if problem is None:
             return 0
         if path is None:
-            print(f"{problem}: writing a fly-through instead")
+            print(f"{problem}: writing a film instead")
         require_output_folder("the folder", Path("renders"))
     if path is not None:
         raise InputError("--path needs a window; `pansplat render SCENE --path FILE -o film.mp4` draws its film")
-    with progress_bar():  # of poses, which take minutes for a tour without them
+    with progress_bar():  # the poses of a tour without them take minutes
         entries = find_entries(expand_home(options.path), options.reading, options.prediction)
     show_all = options.pair == "all"
     first = 0 if show_all else choose_entry(entries, options.pair)
@@ -140,7 +138,7 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
     The window opens when the panoramas are known. Their poses may arrive later.
     """
     from pansplat.tours.camera_path import CameraPath
-    from pansplat_viewer.scene.state import ViewerState
+    from pansplat_viewer.core.state import ViewerState
 
     try:
         from pansplat_viewer.viewer import Viewer
@@ -179,38 +177,37 @@ def _run_window(options: Options, pixels: tuple[int, int], path: "CameraPath | N
             loader,
             find=find,
             state=state,
-            at=options.at or 0.0,
             dpi_scale=window.dpi_scale,
             renderer=options.renderer,
             recent=find_file(),
         )
         if loader.is_searching:
-            viewer.scenes.expect(entries, source, options.pair)
+            viewer.session.expect(entries, source, options.pair)
         else:
-            viewer.scenes.show(entries, first, source)
+            viewer.session.show(entries, first, source)
         try:
             run_viewer(window, viewer)
             return None
         except ContextLostError:  # start again with the same scene, camera and settings
             if attempt == _MAX_CONTEXTS - 1:
                 raise
-            scenes, loader = viewer.scenes, create_loader()
-            if scenes.path is None:  # poses were being estimated
+            session, loader = viewer.session, create_loader()
+            if session.path is None:  # poses were being estimated
                 loader.search(source, find)
             else:
-                entries, first, source = scenes.entries, max(scenes.current, 0), scenes.path
+                entries, first, source = session.entries, max(session.current, 0), session.path
     return None
 
 
 def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple[int, int]) -> None:
-    """Load one entry and write its fly-through to a folder, with a progress bar.
+    """Load one entry and write its film to a folder, with a progress bar.
 
     Names of scenes and files are printed as soon as they are there.
     """
     from pansplat_viewer.capture import open_film, write_flight
+    from pansplat_viewer.core.state import fit_settings
+    from pansplat_viewer.core.tour_scenes import TourScenes
     from pansplat_viewer.draw.cpu_renderer import create_renderer
-    from pansplat_viewer.scene.state import fit_settings
-    from pansplat_viewer.scene.tour import TourScenes
 
     ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
     with progress_bar():
@@ -225,28 +222,16 @@ def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple
         def show_file(file: Path) -> None:
             print(file, flush=True)
 
-        loaded = load(entry, _PREDICTION_PART * _find_part(entry))
+        loaded = load(entry, _PREDICTION_PART)
         scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(_SETTINGS, loaded.scene)
         scenes = None if tour is None else TourScenes.start(loaded)
         create = partial(create_renderer, ctx, options.renderer, color_bits=32)
-        at = 0.5 if options.at is None else options.at
         try:
             with open_film(create, loaded, scenes, load, pixels, settings) as film:
-                write_flight(film, scene, scenes, folder, options.fps, options.seconds, at, settings, show_file)
+                write_flight(film, scene, tour, folder, options.fps, options.seconds, show_file)
         finally:
             if ctx is not None:
                 ctx.release()
-
-
-def _find_part(entry: SceneEntry) -> float:
-    """The fraction of the panoramas of its tour that an entry is predicted from."""
-    tour = entry.tour
-    if tour is None:
-        return 1.0
-    from pansplat.tours.walks import plan_walk
-
-    first = tour.parts[plan_walk(tour)[0]]  # the part that a tour begins with
-    return (len(entry.views) or tour.parts.count(first)) / len(tour)
 
 
 def _create_context(renderer: RendererChoice) -> "moderngl.Context | None":

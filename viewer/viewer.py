@@ -1,6 +1,6 @@
 """The viewer without its window: scene, image and panels on any OpenGL context, one frame at a time.
 
-`Viewer` holds the objects of the application; `Scenes` follows the life of each scene.
+`Viewer` holds the objects of the application; `Session` has the scenes.
 Keys and panels change `state` at once, and queue all other actions, which are done at the end of the frame.
 """
 
@@ -12,7 +12,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from imgui_bundle import imgui
 
+from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
@@ -31,24 +31,23 @@ from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
+from pansplat_viewer.core.hotspots import Hotspot, find_clicked, find_hotspots
+from pansplat_viewer.core.loader import Find, SceneEntry, SceneLoader
+from pansplat_viewer.core.picking import PickedPoint, compute_pixel_ray, pick_point
+from pansplat_viewer.core.placing_by_hand import PlacingByHand
+from pansplat_viewer.core.settings import RendererChoice
+from pansplat_viewer.core.state import ViewerState, advance_path
 from pansplat_viewer.draw.frame_renderer import render_image
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.hotspots import Hotspot, find_clicked, find_hotspots
-from pansplat_viewer.scene.loader import Find, SceneEntry, SceneLoader
-from pansplat_viewer.scene.picking import PickedPoint, compute_pixel_ray, pick_point
-from pansplat_viewer.scene.placing import Placing
-from pansplat_viewer.scene.settings import RendererChoice
-from pansplat_viewer.scene.state import ViewerState, advance_path
-from pansplat_viewer.scenes import Scenes
+from pansplat_viewer.session import Session
 from pansplat_viewer.ui.panels import Panels
 from pansplat_viewer.ui.stage import DRAW_ERRORS, Stage, describe_error
 from pansplat_viewer.window.gui import Gui
 from pansplat_viewer.window.input import apply_input, read_input
 from pansplat_viewer.window.recent import add_recent, read_recent
 
-PANORAMA_HEIGHT = 1024  # pixels, of screenshots
-_MAX_STEP_SECONDS = 0.25  # of camera movement in one frame
-_NOTE_COSINE = math.cos(math.radians(5))  # of the angle within which a note is at the middle of the image
+PANORAMA_HEIGHT = 1024  # rows of a screenshot that is a panorama
+_MAX_STEP_SECONDS = 0.25  # longest camera movement of one frame
+_NOTE_COSINE = math.cos(math.radians(5))  # within this angle of the image's middle, a note is there
 
 
 class Viewer:
@@ -73,7 +72,6 @@ class Viewer:
         find: Find,
         state: ViewerState | None = None,
         folder: Path = Path("renders"),
-        at: float = 0.0,
         dpi_scale: float = 1.0,
         renderer: RendererChoice = "auto",
         recent: Path | None = None,
@@ -87,7 +85,6 @@ class Viewer:
             find: returns the entries of a path that a user opens or drops; called in a worker thread.
             state: the initial state.
             folder: screenshots are written to its subfolder with the entry's name.
-            at: fraction of the flight at which a scene is entered.
             dpi_scale: size of the panels.
             renderer: draws the image; `auto` is `cpu` where OpenGL is software.
             recent: file of the paths that were opened; None remembers none.
@@ -97,16 +94,15 @@ class Viewer:
         self.error: str | None = None
         self._clock = clock
         self.stage = Stage(ctx, renderer, self.state, self.show_error)
-        self.scenes = Scenes(
+        self.session = Session(
             self.state,
             self.stage,
             loader,
             find,
-            at=at,
             show_error=self.show_error,
             listed=self._note_listed,
         )
-        self.placing: Placing | None = None
+        self.placing: PlacingByHand | None = None
         self._placed: SceneEntry | None = None  # whose panoramas `placing` has
         self._folder = folder
         self.panels = Panels(ctx)
@@ -129,7 +125,7 @@ class Viewer:
     def busy(self) -> bool:
         """Whether the next frame differs without new input."""
         is_placing = self.placing is not None and self.placing.progress is not None
-        return self.moving or self.scenes.is_busy or self.stage.photographs.is_reading or is_placing
+        return self.moving or self.session.is_busy or self.stage.photographs.is_reading or is_placing
 
     @property
     def moving(self) -> bool:
@@ -141,22 +137,17 @@ class Viewer:
         """The image that is drawn in the background, if the window changes only when it is finished."""
         return None if self.stage.is_animated(self._clock()) else self.stage.pending
 
-    @property
-    def panoramas(self) -> list[str]:
-        """The names of the input cameras of the scene, or their numbers."""
-        scene = self.stage.slot.scene
-        names = scene.names if scene is not None else ()
-        return [names[k] if k < len(names) else str(k + 1) for k in range(len(self.state.context))]
-
     def _find_hotspots(self) -> list[Hotspot]:
-        """The places of panoramas in the image, in points of the window, which may have several pixels."""
-        camera, fade = self.state.camera, self.stage.fade
-        size = imgui.get_io().display_size
-        points = int(size.x), int(size.y)
-        tour, moment = self.scenes.tour, self.state.moment
-        if tour is None or fade.parts[fade.front] != tour.part or (moment is not None and moment.arrival is not None):
+        """The places of panoramas in the image, in points of the window, which may have several pixels; none while the
+        camera flies."""
+        state, fade, size = self.state, self.stage.fade, imgui.get_io().display_size
+        tour, moment, place = self.session.tour, state.moment, None
+        if moment is None or moment.step.kind not in ("flight", "zoom"):
+            place = self.session.find_place()
+        if state.graph is None or place is None or (tour is not None and fade.parts[fade.front] != tour.part):
             return []
-        return find_hotspots(tour, camera, points)
+        left = self.panels.width if state.overlay else 0.0
+        return find_hotspots(state.graph, place, state.camera, (int(size.x), int(size.y)), left)
 
     # --- frames ---
 
@@ -168,12 +159,12 @@ class Viewer:
         state, stage = self.state, self.stage
         _, _, width, height = target.viewport
         state.now, stage.size = self._clock(), (width, height)
-        self.scenes.poll()
+        self.session.poll()
         if not self.moving:
-            self.scenes.exchange()
-        if self.scenes.entry is not self._placed:
-            self._placed = self.scenes.entry
-            self.placing = Placing.open(self.placing, self._placed, self.scenes.entries)
+            self.session.exchange()
+        if self.session.entry is not self._placed:
+            self._placed = self.session.entry
+            self.placing = PlacingByHand.open(self.placing, self._placed, self.session.entries)
         if self.placing is not None:
             self.placing.update()
             self.error, self.placing.error = self.placing.error or self.error, None
@@ -186,10 +177,10 @@ class Viewer:
             events = self.placing.apply(events)
         apply_input(self, events)
         step = min(seconds, 2 * _MAX_STEP_SECONDS)
-        self.scenes.fly(step, was_playing)
+        self.session.fly(step, was_playing)
         advance_path(state, step)
-        self.scenes.update()
-        if self.scenes.loaded is None and self.scenes.tour is None:
+        self.session.update()
+        if self.session.loaded is None and self.session.tour is None:
             stage.fade_to_photograph(stage.photographs.find_nearest(np.asarray(state.camera.position)))
         stage.draw(target)
         self.gui.end(self._ctx, target)
@@ -201,7 +192,7 @@ class Viewer:
         """Stop the threads and free every GL object; the context must still be current."""
         if self.placing is not None:
             self.placing.close()
-        self.scenes.loader.close()
+        self.session.loader.close()
         self.stage.release()
         self.panels.release()
         self.gui.close()
@@ -216,20 +207,14 @@ class Viewer:
     def dismiss_error(self) -> None:
         """Close the error message, and go on with the scene that is shown."""
         self.error = None
-        self.scenes.dismiss()
+        self.session.dismiss()
 
     # --- actions of keys and panels ---
-
-    def focus_center(self) -> None:
-        """Orbit the point in the centre of the image."""
-        point, state = self._pick((0.5, 0.5)), self.state
-        if point is not None:
-            state.camera, state.orbiting = cameras.focus_on_point(state.camera, np.array(point.position)), True
 
     def click(self, place: tuple[float, float]) -> None:
         """Fly to the panorama of the hotspot at a place, or show the point there; fractions of width and height."""
         state = self.state
-        if state.hotspots and state.overlay:
+        if state.plan and state.overlay:
             points = imgui.get_io().display_size
             state.target = find_clicked(self.hotspots, (place[0] * points.x, place[1] * points.y))
         if state.target is None:
@@ -238,30 +223,38 @@ class Viewer:
 
     def _pick(self, place: tuple[float, float]) -> PickedPoint | None:
         """The point of the scene at a place of the image; None, and a message, if there is none."""
-        state, stage, scene = self.state, self.stage, self.stage.slot.scene
-        if scene is None or stage.photograph is not None:
+        state, stage = self.state, self.stage
+        if stage.slot.scene is None or stage.photograph is not None:
             return None
         pixel = place[0] * stage.size[0], place[1] * stage.size[1]
-        point = pick_point(scene, *compute_pixel_ray(state.camera, pixel, stage.size), state.settings)
+        ray = compute_pixel_ray(state.camera, pixel, stage.size)
+        stage.slot.image = None  # its texture may hold another image afterwards
+        try:
+            point = pick_point(stage.renderer, *ray, state.settings)
+        except DRAW_ERRORS as error:
+            self.show_error(describe_error(error))
+            return None
         if point is None:
             state.show_message("no Gaussian there")
         return point
 
     def write_screenshot(self, suffix: str, panorama: bool = False) -> None:
-        """Write the image, or the panorama at the camera, as PNG, or EXR with depth in metres.
+        """Write the image as PNG, or EXR with depth in metres, or the panorama at the camera without its display.
 
         The file is the first of `view_001.png`, `view_002.png`, ... (`panorama_001.png`, ...) that does not exist.
         """
-        stage, state, loaded = self.stage, self.state, self.scenes.loaded
+        stage, state, loaded = self.stage, self.state, self.session.loaded
         if loaded is None or stage.photograph is not None:
             state.show_message("there is no scene of this place yet")
             return
-        settings = replace(state.draw_settings, layout="equirect" if panorama else "pinhole")
-        size = (2 * PANORAMA_HEIGHT, PANORAMA_HEIGHT) if panorama else stage.size
         stage.slot.image = None  # the texture will hold the screenshot
+        pose, settings, depth = state.camera.cam2world, state.draw_settings, None
         try:
-            pose = state.camera.cam2world
-            color, depth = render_image(stage.renderer, pose, size, settings, with_depth=suffix == "exr")
+            if panorama:
+                blend, size = settings.view if settings.mode == "view" else settings.mode, PANORAMA_HEIGHT
+                color = pipeline.render(stage.slot.scene, pose, blend=blend, size=(size, 2 * size)).color
+            else:
+                color, depth = render_image(stage.renderer, pose, stage.size, settings, with_depth=suffix == "exr")
             folder, stem = self._folder / loaded.entry.folder_name, "panorama" if panorama else "view"
             folder.mkdir(parents=True, exist_ok=True)
             files = (folder / f"{stem}_{number:03d}.{suffix}" for number in itertools.count(1))
@@ -294,17 +287,17 @@ class Viewer:
         """Write the key frames of the camera path."""
         file = Path(text).expanduser()
         with self._showing_errors():
-            if self.scenes.loaded is not None:
+            if self.session.loaded is not None:
                 require_replaceable("the camera path", [file])
-                write_path(self.state.path.map_places(self.scenes.loaded.scene.frame.globalize_places), file)
+                write_path(self.state.path.map_places(self.session.loaded.scene.frame.globalize_places), file)
                 self.state.show_message(f"wrote {text}; pansplat render SCENE --path {text} -o film.mp4 draws it")
 
     def open_path(self, text: str) -> None:
         """Read the key frames of a camera path."""
         with self._showing_errors():
-            if self.scenes.loaded is not None:
+            if self.session.loaded is not None:
                 path = read_path(Path(text).expanduser())
-                self.state.path = path.map_places(self.scenes.loaded.scene.frame.localize_places)
+                self.state.path = path.map_places(self.session.loaded.scene.frame.localize_places)
                 self.state.path_seconds, self.state.path_playing = 0.0, False
 
     @contextlib.contextmanager

@@ -127,7 +127,7 @@ def test_an_installed_wheel_needs_its_dependencies_only(environment: Path, tmp_p
     save_ply(scene, tmp_path / "scene.ply")
     options = ["--offscreen", "out", "--size", "64x32", "--seconds", "0.1"]
     run_in(tmp_path, environment / "bin" / "pansplat-view", "scene.ply", *options)
-    with av.open(str(tmp_path / "out" / "flythrough.mp4")) as film:
+    with av.open(str(tmp_path / "out" / "film.mp4")) as film:
         assert len(list(film.decode(video=0))) > 1
 
 

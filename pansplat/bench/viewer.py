@@ -38,12 +38,11 @@ from pansplat.gaussians.scene import Scene
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-View = Literal["perspective", "coarse", "look-around", "panorama"]
+View = Literal["perspective", "coarse", "look-around"]
 Mode = Literal["joint", "deferred"]
 
 FOV_DEGREES = 75.0  # vertical, as in the window
 RENDERERS = ("cpu", "gl")
-_PANORAMA_SIZE = (1024, 512)  # width and height of panoramas, pixels
 _MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
 _VIEWER_PACKAGE = "pansplat_viewer"
 _RATES = (15, 60)  # lines of the plot, frames per second
@@ -55,8 +54,7 @@ class ViewerCase:
 
     Attributes:
         renderer: `cpu` or `gl`.
-        view: `perspective` moves; `coarse` moves at half the resolution; `look-around` turns and reads cube faces;
-            `panorama` has all directions; OpenGL stitches it from six cube faces.
+        view: `perspective` moves; `coarse` moves at half the resolution; `look-around` turns and reads cube faces.
         mode: `joint` or `deferred`.
         width, height: the size of the image, pixels.
     """
@@ -70,13 +68,11 @@ class ViewerCase:
     @property
     def image_key(self) -> tuple[object, ...]:
         """The values that the exact image depends on."""
-        return self.view == "panorama", self.mode, self.width, self.height
+        return self.mode, self.width, self.height
 
     def settings(self) -> dict[str, object]:
         """The values of the viewer's `DrawSettings`, and the size."""
         values: dict[str, object] = {"mode": self.mode, "size": [self.width, self.height]}
-        if self.view == "panorama":
-            return {**values, "layout": "equirect"}
         return {**values, "vertical_fov_degrees": FOV_DEGREES, "cached": self.view == "look-around"}
 
 
@@ -91,7 +87,6 @@ def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = RENDERER
         "perspective": size,
         "coarse": (size[0] // 2, size[1] // 2),
         "look-around": size,
-        "panorama": _PANORAMA_SIZE,
     }
     return [
         ViewerCase(renderer, view, mode, *sizes[view])
@@ -99,7 +94,6 @@ def list_viewer_cases(size: tuple[int, int], renderers: Sequence[str] = RENDERER
         for view in sizes
         for mode in ("joint", "deferred")
         if renderer == "cpu" or view != "coarse"
-        if view != "panorama" or mode == "joint"
     ]
 
 
@@ -170,7 +164,7 @@ def _render_exact(scene: Scene, pose: Tensor, cases: Sequence[ViewerCase]) -> di
             pose,
             blend=case.mode,
             size=(case.height, case.width),
-            layout="equirect" if case.view == "panorama" else "pinhole",
+            layout="pinhole",
             vertical_fov_degrees=FOV_DEGREES,
             backend="torch",
         ).color

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pansplat.rendering import Rendering
     from pansplat.tours.camera_path import CameraPath
     from pansplat.tours.graph import TourGraph
-    from pansplat.tours.route import Route
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 _VIDEO_HEIGHT, _PANORAMA_VIDEO_HEIGHT = 1080, 1440  # rows of a video: perspective, and panoramic
@@ -68,7 +67,7 @@ class Render(Computation):
     fov: Annotated[float, Meta(ge=1, le=170)] = 90.0
     """Vertical field of view of `perspective`, degrees."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Length of a video; 4 by default, for a tour that of the ways through all panoramas."""
+    """Length of a video; by default that of the ways through all panoramas."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of a video."""
     prediction: ScenePrediction = field(default_factory=ScenePrediction)
@@ -158,21 +157,21 @@ class Render(Computation):
     def _pose_between_cameras(self, scene: Scene) -> Tensor:
         import torch
 
-        fraction, route = 0.5 if self.at is None else self.at, _plan_route(scene)
-        return scene.pose_between(fraction) if route is None else torch.from_numpy(route.pose(fraction))
+        from pansplat.export.film import plan_visits
+
+        fraction = 0.5 if self.at is None else self.at
+        return torch.from_numpy(plan_visits(scene).pose(fraction)) if scene.tour else scene.pose_between(fraction)
 
     def _list_shots(self, scene: Scene, path: CameraPath | None) -> list[Shot]:
         """The frames of a film: of a path, or of the flight through all input cameras."""
-        from pansplat.export.film import follow_path, list_flight
-        from pansplat.geometry.path import fly_pose
+        from pansplat.export.film import follow_path, list_flight, plan_visits
         from pansplat.tours.merge import make_graph
 
         if path is not None:
             return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
-        flight = _plan_route(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
-        return list_flight(flight, self.fps, self.fov, self.seconds)
+        return list_flight(plan_visits(scene), self.fps, self.fov, self.seconds)
 
     def _make_film(
         self, scene: Scene, source: PanoramaSet | TourGraph | None, options: dict[str, Any], count: int
@@ -204,18 +203,6 @@ class Render(Computation):
         photographs = FilmPhotographs.open(source, scene) if source is not None and is_plain else None
         choose = (lambda shot: (scene, 0)) if isinstance(options["blend"], int) else choose_scenes(scene)
         return Film(choose, draw, "pinhole" if is_perspective else "equirect", options["size"], photographs)
-
-
-def _plan_route(scene: Scene) -> Route | None:
-    """The way through a tour; None for another scene."""
-    from pansplat.tours.facts import TourFacts
-    from pansplat.tours.route import REST_SECONDS, plan_route
-    from pansplat.tours.walks import plan_walk
-
-    if scene.tour is None:
-        return None
-    facts = TourFacts(scene)
-    return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
 def read_pose(path: Path) -> Tensor:

@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,22 +26,23 @@ from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
+from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.limits import follow_edge
 from pansplat.tours.merge import make_graph, select_views
-from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
+from pansplat.tours.route import REST_SECONDS, STOP_REACH, Moment, Route, find_offset, plan_route
 from pansplat.tours.scene_views import choose_scene_views
+from pansplat.tours.walks import plan_walk
 
-FLIGHT_SECONDS = 4.0  # of the film of a pair
-_HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
+_FADE_METRES = 0.2  # way along which a photograph fades beside a camera path: 0.2 s at a metre a second
+_HEIGHTS = (512, 1024, 2048, 4096)  # rows of photographs in memory; the least that is as dense as the frame is read
 
 Image = Float[np.ndarray, "height width 3"]
 Pose = Float[np.ndarray, "4 4"]
-DrawnPose = tuple[Pose, float, Callable[[], Image]]  # a pose, its weight, and what draws it
 
 
 class FilmPhotographs:
-    """Photographs over the frames of a film within `STOP_REACH` of their panoramas; they fade for `STOP_SECONDS`.
+    """Photographs over the frames of a film near their panoramas.
 
     What masks hide is not shown: the image of the Gaussians stays there.
     """
@@ -62,8 +62,6 @@ class FilmPhotographs:
         """
         self._poses = cam2world[: len(photographs)].double().cpu()
         self._gains = torch.tensor(gains)[:, :, None, None] if gains else None
-        self._weights: dict[int, float] = {}  # of the photographs near the poses of the last frame
-        self._seconds = 0.0  # of the last frame
 
         @functools.lru_cache(maxsize=2)
         def load(index: int, height: int) -> Float[Tensor, "4 height width"]:
@@ -81,28 +79,13 @@ class FilmPhotographs:
         gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
         return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
 
-    def mix(self, frame: Sequence[DrawnPose], plane: ImagePlane, seconds: float) -> Image:
-        """The image of a frame, with the photographs of the panoramas at which its poses stand.
-
-        A photograph is shown at once in the first frame that is near its panorama after a cut.
-
-        Args:
-            frame: what is mixed.
-            plane: size and field of view.
-            seconds: time of the frame in the film.
-        """
-        step, self._seconds = abs(seconds - self._seconds) / STOP_SECONDS, seconds
-        last, self._weights = self._weights, {}
-        mixed: Any = 0.0
-        for pose, share, draw in frame:
-            distances = np.linalg.norm(self._poses[:, :3, 3].numpy() - pose[:3, 3], axis=1)
-            index, nearest = int(distances.argmin()) if len(distances) else -1, distances.min(initial=np.inf)
-            weight = float(nearest <= STOP_REACH)
-            if index in last:
-                weight = last[index] + min(max(weight - last[index], -step), step)
-            self._weights[index] = weight
-            mixed += share * self.cover(index, weight, pose, plane, draw)
-        return mixed
+    def find_stop(self, pose: Pose) -> tuple[int | None, float]:
+        """The photograph at whose panorama a camera is, and its weight, which falls beyond `STOP_REACH`."""
+        distances = np.linalg.norm(self._poses[:, :3, 3].numpy() - pose[:3, 3], axis=1)
+        if not len(distances):
+            return None, 0.0
+        nearest = int(distances.argmin())
+        return nearest, min(max(1 - (float(distances[nearest]) - STOP_REACH) / _FADE_METRES, 0.0), 1.0)
 
     def cover(
         self, index: int | None, weight: float, pose: Pose, plane: ImagePlane, draw: Callable[[], Image]
@@ -158,30 +141,27 @@ class Shot:
         return Shot(moment.pose, fov, seconds, moment, goal)
 
 
-def list_flight(
-    flight: Route | Callable[[float], Float[np.ndarray, "4 4"]],
-    fps: float,
-    vertical_fov_degrees: float,
-    seconds: float | None = None,
-) -> list[Shot]:
-    """The frames of a flight, two or more.
+def plan_visits(scene: Scene) -> Route:
+    """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
+    facts = TourFacts(scene)
+    outlooks = dict(enumerate(facts.outlooks))
+    if scene.tour is not None:
+        return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=outlooks)
+    tour = facts.tour.with_all_edges()
+    return plan_route(tour, range(len(tour)), rest=REST_SECONDS, outlooks=outlooks)
+
+
+def list_flight(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
+    """The frames of a way through panoramas, two or more.
 
     Args:
-        flight: the pose at a fraction of the flight, or the route through a tour.
+        route: the way.
         fps: frames per second.
         vertical_fov_degrees: of each frame.
-        seconds: duration, 4 by default; that of a route changes the speed of the camera and of the fades.
+        seconds: duration, by default that of the route; another one changes the speed of the camera and of the fades.
     """
-    route = flight if isinstance(flight, Route) else None
-    count = max(round((seconds or (FLIGHT_SECONDS if route is None else route.seconds)) * fps), 2)
-    shots = []
-    for number in range(count):
-        at = number / (count - 1)
-        if isinstance(flight, Route):
-            shots.append(Shot.of_moment(flight.at(at), vertical_fov_degrees, at * flight.seconds))
-        else:
-            shots.append(Shot(flight(at), vertical_fov_degrees, number / fps))
-    return shots
+    fractions = np.linspace(0, 1, max(round((seconds or route.seconds) * fps), 2)).tolist()
+    return [Shot.of_moment(route.at(at), vertical_fov_degrees, at * route.seconds) for at in fractions]
 
 
 def follow_path(path: CameraPath, fps: float, scene: Scene, tour: TourGraph | None) -> list[Shot]:
@@ -256,22 +236,17 @@ class Film:
         weight = fade.compute_weight(shot.seconds)
 
         drawn = [
-            (pose, share, functools.partial(self._draw, slot, scene, replace(shot, pose=pose)))
+            (share, functools.partial(self._draw, slot, scene, replace(shot, pose=pose)))
             for slot, share in ((1 - fade.front, 1 - weight), (fade.front, weight))
             if isinstance(scene := fade.contents[slot], Scene) and (pose := fade.poses[slot]) is not None
             if share > 0 or slot == fade.front
         ]
+        photograph = photographs.find_stop(shot.pose) if moment is None else (moment.photograph, moment.weight)
         plane = self._make_plane(shot)
-        if moment is None:
-            return photographs.mix(drawn, plane, shot.seconds)
         image = photographs.cover(
-            moment.photograph,
-            moment.weight,
-            shot.pose,
-            plane,
-            lambda: np.sum([share * draw() for _, share, draw in drawn], axis=0),
+            *photograph, shot.pose, plane, lambda: np.sum([share * draw() for share, draw in drawn], axis=0)
         )
-        if goal is None:
+        if goal is None or moment is None:
             return image
         arrived = photographs.cover(
             moment.step.nodes[1],

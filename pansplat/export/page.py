@@ -359,7 +359,8 @@ def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence
 
     (plane,) = image_planes("pinhole", _POSTER_SIZE, vertical_fov_degrees=fov)
     with torch.no_grad():
-        image = FilmPhotographs(photographs, scene.cam2world).mix([(pose.numpy(), 1.0, draw)], plane, 0.0)
+        stops = FilmPhotographs(photographs, scene.cam2world)
+        image = stops.cover(*stops.find_stop(pose.numpy()), pose.numpy(), plane, draw)
     pixels = (image * 255).round().clip(0, 255).astype(np.uint8)
     with io.BytesIO() as file:
         Image.fromarray(pixels).save(file, "JPEG", quality=80, optimize=True, comment=SOFTWARE.encode())

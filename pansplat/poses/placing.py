@@ -27,6 +27,7 @@ from pansplat.poses.axes import SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import estimate_depth
 from pansplat.tours.floor import find_ceiling, trace_floor
+from pansplat.tours.linked_rooms import turn_plan
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _IMAGE_HEIGHT = 1024  # largest one, in which edges are looked for
@@ -191,9 +192,7 @@ class Piece:
         if outline is None:
             angles = np.linspace(0, 2 * math.pi, 24, endpoint=False)
             outline = 0.3 * np.stack((np.sin(angles), np.cos(angles)), axis=1)
-        cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
-        turned = outline @ np.array(((cosine, -sine), (sine, cosine)))
-        return np.array((place.right, place.forward)) + unit * turned
+        return np.array(place[:2]) + unit * outline @ turn_plan(place.yaw)
 
 
 def read_piece(image: Path) -> Piece:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Callable
 from functools import cached_property
@@ -132,10 +131,9 @@ class TourFacts:
 
     @cached_property
     def bounds(self) -> TourGraph:
-        """The graph of a scene without edges whose surfaces stop cameras, which may fly between any two panoramas."""
-        edges = [*itertools.combinations(self.views, 2)] or [(node, node) for node in self.views]
+        """The graph of a scene without edges, whose surfaces stop cameras."""
         clearances = dict(zip(self.views, self.clearances, strict=True))
-        return dataclasses.replace(self.tour, overlaps=dict.fromkeys(edges, 1.0), clearances=clearances)
+        return dataclasses.replace(self.tour.with_all_edges(), clearances=clearances)
 
     @_stored
     def hidden(self) -> list[list[int]]:

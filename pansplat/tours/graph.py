@@ -122,6 +122,11 @@ class TourGraph:
         overlaps = {edge: overlap for edge, overlap in self.overlaps.items() if edge not in every}
         return dataclasses.replace(self, overlaps=add_self_edges(overlaps, range(len(self))), walls=every)
 
+    def with_all_edges(self) -> TourGraph:
+        """The graph of a scene without edges, in which cameras may fly between any two panoramas."""
+        edges = [*itertools.combinations(range(len(self)), 2)] or [(0, 0)]
+        return dataclasses.replace(self, overlaps=dict.fromkeys(edges, 1.0))
+
     def list_parts(self) -> list[ViewNumbers]:
         """The nodes of each part."""
         numbers = np.array(self.parts)

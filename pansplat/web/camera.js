@@ -7,7 +7,7 @@ import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, s
 
 const SOFT = 0.3; // share of the way to the limit of the camera, at its end, in which steps become shorter
 
-// Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
+// Camera to world; positive yaw turns right, positive pitch up (viewer/core/camera.py). The device's motion adds a roll.
 export function rotationOf({ yaw, pitch, roll }) {
   const [c, s] = [Math.cos(roll), Math.sin(roll)];
   return multiply(HEADER.level, multiply(turned(yaw, pitch), [[c, -s, 0], [s, c, 0], [0, 0, 1]]));

@@ -15,7 +15,7 @@ from pansplat.model.pansplat import PanSplat, PanSplatConfig
 from pansplat.networks.weights import load_weights, pack_weights, save_weights
 from pansplat.pipeline import load
 from pansplat.prediction_options import PredictOptions, ReadOptions
-from pansplat_viewer.scene.loader import find_entries, load_entry
+from pansplat_viewer.core.loader import find_entries, load_entry
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.world import WorldFrame
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import show_progress
-from pansplat_viewer.scene.loader import find_entries
+from pansplat_viewer.core.loader import find_entries
 
 
 def test_a_scene_is_written_with_each_surface_once_or_as_it_is(

@@ -20,7 +20,7 @@ from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import is_progress_shown
 from pansplat.system.store import Store
 from pansplat_viewer import run as run_viewer
-from pansplat_viewer.scene.loader import find_entries
+from pansplat_viewer.core.loader import find_entries
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 

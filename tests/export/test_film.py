@@ -10,13 +10,12 @@ import pytest
 import torch
 from synthetic_scenes import make_balls
 
-from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, write_film
+from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.rendering.image_planes import image_planes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
-from pansplat.tours.route import STOP_SECONDS
 
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 POSES[1, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right
@@ -57,48 +56,34 @@ def directions(pose: np.ndarray) -> np.ndarray:
 
 def test_the_photograph_is_shown_at_its_panorama_and_fades_as_the_camera_leaves(photographs: list[PanoramaSet]) -> None:
     stops, drawn = FilmPhotographs(photographs, POSES), []
-
-    def mix(right: float, seconds: float) -> float:
-        def draw() -> np.ndarray:
-            drawn.append(seconds)
-            return GAUSSIANS
-
+    for right, expected in ((0.0, 1.0), (0.03, 1.0), (0.13, 0.5), (0.23, 0.0), (0.5, 0.0)):
         pose = move(0, right)
-        image, photograph = stops.mix([(pose, 1.0, draw)], PLANE, seconds), directions(pose)
-        weight = ((image - GAUSSIANS) * (photograph - GAUSSIANS)).sum() / ((photograph - GAUSSIANS) ** 2).sum()
-        assert np.abs(image - (GAUSSIANS + weight * (photograph - GAUSSIANS))).max() < 0.01
-        return weight
-
-    assert mix(0.0, 5.0) == pytest.approx(1, abs=0.01) and not drawn, "at once, without the Gaussians"
-    assert mix(0.02, 5.1) == pytest.approx(1, abs=0.01) and not drawn
-    assert mix(0.04, 5.1 + STOP_SECONDS / 4) == pytest.approx(0.75, abs=0.01)
-    assert mix(0.2, 5.1 + STOP_SECONDS) == pytest.approx(0, abs=0.01)
-    assert mix(0.01, 6.0 + STOP_SECONDS / 2) == pytest.approx(1, abs=0.01), "a long step"
-    assert mix(0.5, 9.0) == 0
+        index, weight = stops.find_stop(pose)
+        assert index == 0 and weight == pytest.approx(expected)
+        image = stops.cover(index, weight, pose, PLANE, lambda: drawn.append(1) or GAUSSIANS)
+        assert (len(drawn) > 0) == (weight < 1), "a whole photograph needs no Gaussians"
+        mixed = ((image - GAUSSIANS) * (directions(pose) - GAUSSIANS)).sum() / (
+            (directions(pose) - GAUSSIANS) ** 2
+        ).sum()
+        assert mixed == pytest.approx(weight, abs=0.02)
+    assert FilmPhotographs((), POSES).find_stop(pose) == (None, 0.0)
 
 
-def test_a_frame_mixes_the_photographs_of_two_panoramas_without_what_masks_hide(photographs: list[PanoramaSet]) -> None:
-    poses = [move(0, 0.0), move(1, 0.0)]
-    stops = FilmPhotographs(photographs, POSES)
-    frame = [(pose, share, lambda: GAUSSIANS) for pose, share in zip(poses, (0.25, 0.75), strict=True)]
-    image = stops.mix(frame, PLANE, 0.0)
-    first, second = map(directions, poses)
-    height = 1 - 2 * second[..., 1]  # of a direction above the horizon
-    for chosen, shown in ((height > 0, GAUSSIANS), (height < -0.1, second)):
+def test_what_masks_hide_shows_the_gaussians(photographs: list[PanoramaSet]) -> None:
+    pose = move(1, 0.0)
+    image = FilmPhotographs(photographs, POSES).cover(1, 0.75, pose, PLANE, lambda: GAUSSIANS)
+    photograph = directions(pose)
+    height = 1 - 2 * photograph[..., 1]  # of a direction above the horizon
+    for chosen, shown in ((height > 0, GAUSSIANS), (height < -0.1, photograph)):
         assert chosen.sum() > 200
-        assert np.abs(image - (0.25 * first + 0.75 * shown))[chosen].max() < 0.01
+        assert np.abs(image - (0.25 * GAUSSIANS + 0.75 * shown))[chosen].max() < 0.01
 
 
 def test_exposures_become_that_of_the_gaussians(photographs: list[PanoramaSet]) -> None:
     pose = move(0, 0.0)
     stops = FilmPhotographs(photographs, POSES, ((1.25, 1.0, 2.0), (1.0, 1.0, 1.0)))
-    image = stops.mix([(pose, 1.0, lambda: GAUSSIANS)], PLANE, 0.0)
+    image = stops.cover(0, 1.0, pose, PLANE, lambda: GAUSSIANS)
     assert np.abs(image - directions(pose) / (1.25, 1.0, 2.0)).max() < 0.01
-
-
-def test_without_photographs_the_frame_is_drawn(photographs: list[PanoramaSet]) -> None:
-    stops = FilmPhotographs((), POSES)
-    assert (stops.mix([(move(0, 0.0), 1.0, lambda: GAUSSIANS)], PLANE, 0.0) == GAUSSIANS).all()
 
 
 PATH = CameraPath((KeyFrame(0.0, (0, 0, 0), (0, 0, 1)), KeyFrame(1.0, (0, 0, 0.8), (0, 0, 1), 60.0)))
@@ -130,8 +115,10 @@ def test_each_frame_of_a_film_shows_the_path_at_its_time(scene: Scene, tmp_path:
     assert [shot.vertical_fov_degrees for shot in shots[:: len(shots) - 1]] == [75.0, 60.0]
 
 
-def test_a_film_of_a_flight_has_at_least_two_frames() -> None:
-    poses = []
-    shots = list_flight(lambda at: poses.append(at) or np.eye(4), 24.0, 75.0, 0.01)
-    assert len(shots) == 2 and poses == [0, 1]
-    assert len(list_flight(lambda at: np.eye(4), 24.0, 75.0)) == 96
+def test_a_film_of_two_panoramas_moves_as_that_of_a_tour(scene: Scene) -> None:
+    route = plan_visits(scene)
+    kinds = [step.kind for step in route.steps]
+    assert kinds == ["rest", "flight", "rest"] and route.walk == (0, 1)
+    shots = list_flight(route, 24.0, 75.0)
+    assert len(shots) == round(24 * route.seconds) and shots[-1].moment.photograph == 1
+    assert [shot.seconds for shot in list_flight(route, 24.0, 75.0, 0.01)] == [0, route.seconds], "two frames at least"

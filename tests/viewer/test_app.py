@@ -1,10 +1,11 @@
-"""The command: fast help, clear errors, and a fly-through where there is no display."""
+"""The command: fast help, clear errors, and a film where there is no display."""
 
 import json
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -14,8 +15,8 @@ from refusals import expect_error
 
 from pansplat_viewer import run
 from pansplat_viewer.app import Options
-from pansplat_viewer.capture import STILLS, compute_flight_pose
-from pansplat_viewer.scene.loader import SceneEntry, choose_entry
+from pansplat_viewer.capture import write_flight
+from pansplat_viewer.core.loader import SceneEntry, choose_entry
 
 
 @pytest.fixture(autouse=True)
@@ -47,41 +48,38 @@ def test_drawing_on_the_processor_imports_no_opengl(room):
     code = f"import sys\nfrom pansplat_viewer import run\nassert run({arguments}) == 0\n"
     code += "assert 'moderngl' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=room.parent, timeout=600, check=True)
-    assert (room.parent / "out" / "view_000.png").exists()
+    assert (room.parent / "out" / "01_a.png.png").exists()
 
 
 @pytest.mark.gl
-def test_without_a_display_a_fly_through_is_written(room, capsys):
+def test_without_a_display_a_film_is_written_and_a_still_of_each_panorama(room, capsys):
     assert run([str(room), "--size", "96x64", "--seconds", "0.5", "--fps", "12"]) == 0
-    first_line = capsys.readouterr().out.splitlines()[0]
-    assert "no display" in first_line and "fly-through" in first_line
-    folder = room.parent / "renders" / "room"
-    stills = [f"view_{round(100 * at):03d}.png" for at in STILLS]
-    names = sorted(path.name for path in folder.iterdir())
-    assert names == sorted([*stills, "panorama_050.png", "flythrough.mp4"])
-    images = {}
-    for name in (*stills, "panorama_050.png"):
+    first_line, *files = capsys.readouterr().out.splitlines()
+    assert "no display" in first_line and "writing a film" in first_line
+    folder, stills = room.parent / "renders" / "room", []
+    names = ["01_a.png.png", "02_b.png.png", "film.mp4"]
+    assert sorted(path.name for path in folder.iterdir()) == names == [Path(line).name for line in files[1:]]
+    for name in names[:2]:
         with Image.open(folder / name) as image:
-            images[name] = np.asarray(image).astype(int)
-    assert images["panorama_050.png"].shape == (64, 128, 3)
-    with av.open(str(folder / "flythrough.mp4")) as film:
+            stills.append(np.asarray(image).astype(int))
+    with av.open(str(folder / "film.mp4")) as film:
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(video=0)]
-    assert len(frames) == 6 and frames[0].shape == images["view_050.png"].shape == (64, 96, 3)
-    assert np.abs(images["view_000.png"] - frames[0]).mean() < 6, "the film starts with the first still"
-    assert np.abs(images["view_100.png"] - frames[-1]).mean() < 6, "the film ends with the last still"
-    assert np.abs(images["view_050.png"] - frames[0]).mean() > 8
+    assert len(frames) == 6 and frames[0].shape == stills[0].shape == (64, 96, 3)
+    assert np.abs(stills[0] - frames[0]).mean() < 6, "the film starts with the first still"
+    assert np.abs(stills[1] - frames[-1]).mean() < 6, "the film ends with the last still"
+    assert np.abs(stills[1] - frames[0]).mean() > 8
 
 
 @pytest.mark.gl
-def test_with_an_unusable_display_a_fly_through_is_written(room, capsys, monkeypatch):
+def test_with_an_unusable_display_a_film_is_written(room, capsys, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":98765")
     assert run([str(room), "--size", "64x32", "--seconds", "0.2"]) == 0
     first_line = capsys.readouterr().out.splitlines()[0]
-    assert "98765" in first_line and "writing a fly-through" in first_line
-    assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
+    assert "98765" in first_line and "writing a film" in first_line
+    assert (room.parent / "renders" / "room" / "film.mp4").exists()
 
 
-def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(room):
+def test_without_the_libraries_of_window_and_opengl_a_film_is_written(room):
     """On a machine whose user may not install system packages: imgui needs libX11, contexts need libEGL."""
     code = (
         "import sys\n"
@@ -91,14 +89,14 @@ def test_without_the_libraries_of_window_and_opengl_a_fly_through_is_written(roo
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
-    assert "libraries cannot be loaded" in done.stdout and "writing a fly-through" in done.stdout.splitlines()[0]
-    assert (room.parent / "renders" / "room" / "flythrough.mp4").exists()
+    assert "libraries cannot be loaded" in done.stdout and "writing a film" in done.stdout.splitlines()[0]
+    assert (room.parent / "renders" / "room" / "film.mp4").exists()
 
 
 @pytest.mark.gl
-def test_offscreen_writes_the_fly_through_to_the_given_folder(room):
+def test_offscreen_writes_the_film_to_the_given_folder(room):
     assert run([str(room), "--offscreen", "out", "--size", "64x32", "--seconds", "0.2"]) == 0
-    assert list((room.parent / "out").rglob("flythrough.mp4"))
+    assert list((room.parent / "out").rglob("film.mp4"))
     assert not (room.parent / "renders").exists()
 
 
@@ -124,10 +122,8 @@ def test_a_path_without_a_window_is_refused(room, capsys, arguments):
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("out/view_025.png", ["--offscreen", "out"]),
-        ("out/flythrough.mp4", ["--offscreen", "out"]),
-        ("out/room/panorama_050.png", ["--offscreen", "out", "--pair", "all"]),
-        ("out/03_Attic.png", ["--offscreen", "out"]),
+        ("out/film.mp4", ["--offscreen", "out"]),
+        ("out/room/03_Attic.png", ["--offscreen", "out", "--pair", "all"]),
     ],
 )
 def test_a_file_of_the_user_needs_overwrite(room, capsys, name, arguments):
@@ -153,18 +149,7 @@ def test_the_size_of_films_is_that_of_the_option(tmp_path):
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 
-def test_the_flight_goes_from_camera_to_camera(small_scene):
-    for fraction, view in ((0.0, 0), (1.0, 1)):
-        center = small_scene.cam2world[view, :3, 3].numpy()
-        assert np.allclose(compute_flight_pose(small_scene, fraction)[:3, 3], center)
-    assert np.allclose(compute_flight_pose(small_scene, 0.5)[:3, :3], np.eye(3)), "level, in the direction of flight"
-
-
-def test_a_scene_without_cameras_is_orbited(small_scene):
-    scene = replace(small_scene, cam2world=small_scene.cam2world[:0])
-    poses = [compute_flight_pose(scene, fraction) for fraction in (0.0, 0.25, 0.5, 1.0)]
-    middle = np.median(scene.gaussians.means.numpy(), axis=0)
-    for pose in poses:
-        ahead = middle - pose[:3, 3]
-        assert np.allclose(pose[:3, 2], ahead / np.linalg.norm(ahead), atol=1e-6)
-    assert np.allclose(poses[0], poses[-1]) and not np.allclose(poses[0], poses[2])
+def test_a_film_of_a_scene_without_cameras_is_refused(small_scene, tmp_path):
+    scene = replace(small_scene, cam2world=small_scene.cam2world[:0], names=())
+    expect_error("no input cameras", write_flight, Mock(), scene, None, tmp_path / "out", 24.0, None, print)
+    assert not (tmp_path / "out").exists()

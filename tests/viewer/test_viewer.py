@@ -1,6 +1,5 @@
 """State and input of the whole viewer, without OpenGL and without a window: nothing is drawn."""
 
-import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,11 +24,10 @@ from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.progress import report_progress
-from pansplat.tours.camera_path import CameraPath
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry, SceneLoader, load_entry
+from pansplat_viewer.core.settings import FrameStats
+from pansplat_viewer.core.state import ViewerState
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, load_entry
-from pansplat_viewer.scene.settings import FrameStats
-from pansplat_viewer.scene.state import ViewerState
 from pansplat_viewer.viewer import Viewer
 from pansplat_viewer.window.input import FAST, KEYS, SLOW, WALK_SPEED, Input
 
@@ -61,7 +59,7 @@ class NoRenderer:
     def upload(self, scene: Scene, prepared: object = None) -> None:
         if (error := NoRenderer.refuse(scene)) is not None:
             raise error
-        self.stats = FrameStats(total=len(scene.gaussians))
+        self.stats = FrameStats()
 
     def render(self, cam2world: np.ndarray, size: tuple[int, int], settings: Any, *, wait: bool = True) -> Mock:
         if NoRenderer.problem is not None:
@@ -69,14 +67,14 @@ class NoRenderer:
         before = settings if not self.scales else self.last
         self.scales.append(settings.scale)
         self.last = settings  # as a GPU, the time that is known is that of the image before
-        self.stats = replace(self.stats, size=size, frame_ms=1.0, timed=before)
+        self.size, self.stats = size, FrameStats(frame_ms=1.0, timed=before)
         return Mock()
 
     def read_color(self) -> np.ndarray:
-        return np.zeros((*SIZE[::-1], 4), np.float32)
+        return np.zeros((*self.size[::-1], 4), np.float32)
 
     def read_depth(self) -> np.ndarray:
-        return np.full(SIZE[::-1], 3.0, np.float32)
+        return np.full(self.size[::-1], 3.0, np.float32)
 
     has_faces = draw_faces = release = lambda self, *_: None
 
@@ -96,7 +94,7 @@ class App:
             MagicMock(), loader, find=lambda *arguments: self.find(*arguments), folder=folder, clock=lambda: self.now,
             **options,
         )  # fmt: skip
-        self.state, self.scenes, self.target = self.viewer.state, self.viewer.scenes, Mock(viewport=(0, 0, *SIZE))
+        self.state, self.session, self.target = self.viewer.state, self.viewer.session, Mock(viewport=(0, 0, *SIZE))
         self.state.stops = False  # the camera is at a panorama, and tests count images of the scene
 
     def frame(self, seconds: float = 1 / 30, **events: Any) -> None:
@@ -125,7 +123,7 @@ class App:
         self.frame()
 
     def show(self, *entries: SceneEntry) -> None:
-        self.viewer.scenes.show(list(entries), 0)
+        self.viewer.session.show(list(entries), 0)
         self.settle()
 
     def fly(self, seconds: float = 0.2) -> None:
@@ -136,7 +134,9 @@ class App:
     @property
     def node(self) -> int:
         """The panorama of the tour that is nearest to the camera."""
-        return int(np.linalg.norm(self.viewer.scenes.tour.tour.positions - self.state.camera.position, axis=1).argmin())
+        return int(
+            np.linalg.norm(self.viewer.session.tour.tour.positions - self.state.camera.position, axis=1).argmin()
+        )
 
     @property
     def content(self) -> object:
@@ -162,7 +162,7 @@ def make_app(small_scene, load_house, tmp_path, monkeypatch) -> Iterator[Callabl
     imgui.set_current_context(context)
     imgui.get_io().display_size = SIZE
     for name in ("viewer.Gui", "viewer.Panels", "ui.stage.Presenter", "ui.stage.PhotographLayer"):
-        monkeypatch.setattr(f"pansplat_viewer.{name}", MagicMock())
+        monkeypatch.setattr(f"pansplat_viewer.{name}", MagicMock(return_value=MagicMock(width=0.0)))
     monkeypatch.setattr("pansplat_viewer.ui.stage.create_renderer", lambda ctx, choice: NoRenderer())
     monkeypatch.setattr("pansplat_viewer.viewer.read_input", lambda seconds: replace(apps[-1].events, seconds=seconds))
     yield make
@@ -216,24 +216,16 @@ ROWS = [  # at the first of two panoramas, which are 0.5 m apart
     ("drag 40 0", "camera.yaw_radians < 0 and camera.position == home.position"),
     ("pan 30 0", "camera.position[0] < 0 and camera.position[2] == approx(0)"),
     ("scroll 1", "camera.vertical_fov_degrees < home.vertical_fov_degrees"),
-    ("press v", "state.orbiting and camera == home"),
-    ("press v; press v", "not state.orbiting"),
-    ("press v; scroll 1", "camera.distance < home.distance"),
-    ("press v; scroll 1", "camera.vertical_fov_degrees == home.vertical_fov_degrees"),
-    *[
-        (f"press v; {turn}", "camera != home and camera.orbit_center == approx(home.orbit_center)")
-        for turn in ("drag 80 10", "scroll 1", *(f"hold {key}" for key in "wasdqe"))
-    ],
-    ("click 0.5 0.5; press f", "state.orbiting and camera.orbit_center == approx(state.points[0].position)"),
-    ("press 2", "camera.position == approx((0, 0, 0.5)) and state.flight == 1"),
-    ("press 2; press 1", "camera.position == approx((0, 0, 0)) and state.flight == 0"),
-    ("press 2; press 3", "camera.position == approx((0, 0, 0.5))"),
-    ("press page down", "camera.position == approx((0, 0, 0.5))"),
-    ("press page down; press page down", "camera.position == approx((0, 0, 0))"),
-    ("press page up", "camera.position == approx((0, 0, 0.5))"),
+    ("press 2; wait 0.6", "state.playing and 0 < camera.position[2] < 0.5"),
+    ("press 2; wait 3", "camera.position == approx((0, 0, 0.5)) and state.flight == 1 and not state.playing"),
+    ("press 2; wait 3; press 1; wait 3", "camera.position == approx((0, 0, 0)) and abs(camera.yaw_radians) > 3"),
+    ("press 2; wait 3; press 3; wait 3", "camera.position == approx((0, 0, 0.5))"),
+    ("press page down; wait 3", "camera.position == approx((0, 0, 0.5))"),
+    ("press page down; wait 3; press page down; wait 3", "camera.position == approx((0, 0, 0))"),
+    ("press page up; wait 3", "camera.position == approx((0, 0, 0.5))"),
     ("press space", "state.playing"),
-    ("press space; wait 10", "not state.playing and state.flight == 1 and camera.position == approx((0, 0, 0.5))"),
-    ("press space; wait 10; press space", "state.playing and state.flight < 0.1"),
+    ("press space; wait 12", "not state.playing and state.flight == 1 and camera.position == approx((0, 0, 0.5))"),
+    ("press space; wait 12; press space", "state.playing and state.flight < 0.1"),
     ("press space; wait 1; press space; wait 1", "not state.playing and 0.1 < state.flight < 0.3"),
     ("press space; scroll 1", "state.playing"),
     ("press space; hold w", "not state.playing"),
@@ -270,7 +262,7 @@ def act(app: App, text: str) -> None:
             app.frame(**{kind: numbers[0] if kind == "scroll" else numbers})
 
 
-RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "path", "points")
+RESET = ("playing", "flight", "overlay", "help", "quit", "path", "points")
 
 
 def test_the_state_of_the_window_after_what_a_user_does(app):
@@ -300,13 +292,13 @@ def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
         raise InputError(f"{path}: no such file or folder")
 
     app.find = find
-    app.scenes.search(Path("nothing"))
+    app.session.search(Path("nothing"))
     app.settle()
     assert "no such file" in app.viewer.error
     app.viewer.dismiss_error()
     app.show(SceneEntry("damaged"))
     assert app.viewer.error.startswith("damaged.ply: 100% unreadable")
-    assert app.scenes.names == ["first", "second"] and app.scenes.current == 0
+    assert app.session.names == ["first", "second"] and app.session.current == 0
     assert app.viewer.stage.slot.scene is small_scene
     app.viewer.dismiss_error()
     assert app.viewer.error is None
@@ -326,42 +318,42 @@ def test_photographs_are_shown_while_their_poses_are_estimated(make_app, parted_
 
     app = make_app()
     app.find = find
-    app.scenes.search(Path("home"))
-    app.until(lambda: app.scenes.tour is not None, "photographs")
-    assert app.scenes.names == ["unplaced"] and isinstance(app.content, int) and app.scenes.loaded is None
-    app.until(lambda: app.scenes.loading == ("home", "pairs of panoramas", 0.3), "progress")
-    assert app.scenes.loader.entry is None, "nothing is predicted from panoramas that may get poses"
+    app.session.search(Path("home"))
+    app.until(lambda: app.session.tour is not None, "photographs")
+    assert app.session.names == ["unplaced"] and isinstance(app.content, int) and app.session.loaded is None
+    app.until(lambda: app.session.loading == ("home", "pairs of panoramas", 0.3), "progress")
+    assert app.session.loader.entry is None, "nothing is predicted from panoramas that may get poses"
     app.state.target = 2
     app.fly()
     app.frame(drag=(120.0, 40.0))
     seen = app.state.camera.rotation[:, 2]
     gate.open()
     app.settle()
-    assert app.scenes.names == ["placed"] and app.scenes.loaded.entry.tour is turned
+    assert app.session.names == ["placed"] and app.session.loaded.entry.tour is turned
     assert np.allclose(app.state.camera.position, turned.positions[2])
     assert np.allclose(app.state.camera.rotation[:, 2], quarter @ seen), "the same place of the same photograph"
     gate.event.clear()
-    shown = app.scenes.loaded
-    app.scenes.search(Path("another"))
-    app.until(lambda: app.scenes.loading == ("another", "pairs of panoramas", 0.3), "progress")
+    shown = app.session.loaded
+    app.session.search(Path("another"))
+    app.until(lambda: app.session.loading == ("another", "pairs of panoramas", 0.3), "progress")
     app.frames(2)
-    assert app.scenes.loaded is shown and app.scenes.names == ["placed"]
+    assert app.session.loaded is shown and app.session.names == ["placed"]
     gate.open()
 
 
 def test_a_search_and_a_prediction_can_be_cancelled(app, small_scene):
     gate = Gate(lambda entry: LoadedScene(entry, small_scene), "estimating poses", 0.3)
     app.find = lambda path, show: gate(path, None)
-    app.scenes.search(Path("unposed"))
-    app.until(lambda: app.scenes.loading == ("unposed", "estimating poses", 0.3), "search")
-    app.scenes.cancel_loading()
-    assert app.scenes.loading is None and app.scenes.current == 0, "the scene is still the current one"
+    app.session.search(Path("unposed"))
+    app.until(lambda: app.session.loading == ("unposed", "estimating poses", 0.3), "search")
+    app.session.cancel_loading()
+    assert app.session.loading is None and app.session.current == 0, "the scene is still the current one"
     app.load = gate
-    app.scenes.reload()
-    app.until(lambda: app.scenes.loading == ("first", "estimating poses", 0.3), "prediction")
-    app.scenes.cancel_loading()
+    app.session.reload()
+    app.until(lambda: app.session.loading == ("first", "estimating poses", 0.3), "prediction")
+    app.session.cancel_loading()
     app.settle()
-    assert app.scenes.loading is app.viewer.error is None
+    assert app.session.loading is app.viewer.error is None
     app.until(lambda: gate.ended == 2, "end of both threads")
 
 
@@ -375,16 +367,16 @@ def test_the_refined_scene_replaces_the_prediction_at_rest_and_keeps_the_camera(
         return LoadedScene(entry, refined)
 
     app.load = load
-    app.scenes.show([SceneEntry("kitchen")], 0)
-    app.until(lambda: app.scenes.refinement == 0.5, "refinement")
-    assert app.scenes.loading is None and not app.scenes.loaded.is_final
+    app.session.show([SceneEntry("kitchen")], 0)
+    app.until(lambda: app.session.refinement == 0.5, "refinement")
+    assert app.session.loading is None and not app.session.loaded.is_final
     app.frame(held=frozenset("w"))
     camera, stage = app.state.camera, app.viewer.stage
     go.set()
-    app.until(lambda: app.scenes.loader.refinement is None, "refined scene")
+    app.until(lambda: app.session.loader.refinement is None, "refined scene")
     app.settle()
     assert stage.slot.scene is refined and app.state.camera == camera
-    assert app.scenes.loader.poll() is None
+    assert app.session.loader.poll() is None
 
 
 def test_a_refined_scene_that_cannot_be_drawn_is_one_error_and_the_prediction_stays(app, small_scene, monkeypatch):
@@ -407,25 +399,23 @@ def test_a_refined_scene_that_cannot_be_drawn_is_one_error_and_the_prediction_st
     assert app.viewer.stage.slot.scene is prediction and refusals == [refined] and app.viewer.error is None
 
 
-def test_a_scene_beyond_the_memory_is_an_error_and_the_scene_before_stays(app, small_scene, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError("too many"), "large: the memory is exhausted (MemoryError: too many); open a scene with fewer"),
+        (moderngl.Error("GLSL Compiler failed"), "large: OpenGL failed: GLSL Compiler failed"),
+    ],
+)
+def test_a_scene_that_cannot_be_drawn_is_an_error_and_the_scene_before_stays(
+    app, small_scene, monkeypatch, error, message
+):
     twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
-    refuse = staticmethod(lambda scene: MemoryError("too many") if scene is twice else None)
-    monkeypatch.setattr(NoRenderer, "refuse", refuse)
+    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error if scene is twice else None))
     app.load = lambda entry, *_: LoadedScene(entry, twice)
     app.show(SceneEntry("large"))
-    assert (
-        app.viewer.error == "large: the memory is exhausted (MemoryError: too many); open a scene with fewer Gaussians"
-    )
-    assert app.scenes.names == ["large"]
+    assert app.viewer.error.startswith(message) and app.session.names == ["large"]
     app.viewer.dismiss_error()
-    assert app.viewer.stage.slot.scene is small_scene and app.scenes.names == ["first", "second"]
-
-
-def test_an_error_of_opengl_is_not_called_exhausted_memory(app, monkeypatch):
-    error = moderngl.Error("GLSL Compiler failed")
-    monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error))
-    app.show(SceneEntry("refused"))
-    assert app.viewer.error == "refused: OpenGL failed: GLSL Compiler failed"
+    assert app.viewer.stage.slot.scene is small_scene and app.session.names == ["first", "second"]
 
 
 def test_memory_that_ends_while_drawing_is_an_error_and_drawing_goes_on(app, monkeypatch):
@@ -448,18 +438,18 @@ def test_a_large_scene_is_converted_while_the_window_accepts_input(make_app, pai
         return scene
 
     monkeypatch.setattr(NoRenderer, "prepare", staticmethod(prepare))
-    monkeypatch.setattr("pansplat_viewer.scene.slots._SMALL_SCENE", 0)
+    monkeypatch.setattr("pansplat_viewer.draw.rendered_scene._SMALL_SCENE", 0)
     app = make_app()
     app.show(SceneEntry("first", pair=pair))
     app.load = lambda entry, *_: LoadedScene(entry, other)
-    app.scenes.show([SceneEntry("large")], 0)
-    app.until(lambda: app.scenes.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
+    app.session.show([SceneEntry("large")], 0)
+    app.until(lambda: app.session.loading == ("large", "preparing 1,200 Gaussians", 0.25), "preparation")
     assert app.viewer.busy and app.viewer.stage.slot.scene is small_scene
     app.frame(drag=(30.0, 0.0))
     assert app.state.camera.yaw_radians != 0
     go.set()
     app.settle()
-    assert app.viewer.stage.slot.scene is other and app.scenes.loading is None
+    assert app.viewer.stage.slot.scene is other and app.session.loading is None
 
 
 def test_the_time_of_a_frame_is_recorded_for_its_own_resolution(app, monkeypatch):
@@ -482,13 +472,13 @@ def test_a_reload_searches_the_folder_again(app, pair, tmp_path):
         return [SceneEntry(name, pair=pair) for name in ("new", "pair 1", "pair 2")[len(found) == 1 :]]
 
     app.find = find
-    app.scenes.search(folder)
+    app.session.search(folder)
     app.settle()
-    assert app.scenes.names == ["pair 1", "pair 2"]
-    app.scenes.reload()
+    assert app.session.names == ["pair 1", "pair 2"]
+    app.session.reload()
     app.settle()
     assert found == [folder] * 2
-    assert app.scenes.names[app.scenes.current] == "pair 1" and app.scenes.current == 1
+    assert app.session.names[app.session.current] == "pair 1" and app.session.current == 1
 
 
 # --- photographs and comparison ---
@@ -502,7 +492,7 @@ def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
     for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
         app = make_app()
         pair = PanoramaSet("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
-        app.scenes.show([SceneEntry("alone", pair=pair)], 0)
+        app.session.show([SceneEntry("alone", pair=pair)], 0)
         assert app.state.camera == app.state.home
         assert app.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
 
@@ -510,13 +500,13 @@ def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
 def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair, small_scene):
     app = make_app()
     app.load = gate = Gate(lambda entry: LoadedScene(entry, small_scene), "matching", 0.5)
-    app.scenes.show([SceneEntry("kitchen", pair=pair)], 0)
+    app.session.show([SceneEntry("kitchen", pair=pair)], 0)
     app.until(lambda: app.content == 0, "photograph")
     app.frame(drag=(-120.0, 0.0))
     camera = app.state.camera
     gate.open()
     app.until(lambda: app.content is small_scene, "scene")
-    assert camera.yaw_radians > 0.1 and app.state.camera == replace(camera, distance=app.state.camera.distance)
+    assert camera.yaw_radians > 0.1 and app.state.camera == camera
 
 
 def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):
@@ -536,26 +526,12 @@ def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
     assert app.viewer.error.startswith("no screenshot written: the memory is exhausted (MemoryError: no memory)")
 
 
-@pytest.fixture
-def path_app(app) -> App:
-    """The viewer with a path of two key frames, 1 s apart, at the second."""
+def test_a_path_replaces_its_own_file_only(app, tmp_path):
     app.press("k")
-    app.state.camera = replace(app.state.camera, position=(0.2, 0.0, 0.3), yaw_radians=0.5)
-    app.state.path_seconds = 1.0
-    app.press("k")
-    assert [frame.seconds for frame in app.state.path.key_frames] == [0.0, 1.0]
-    return app
-
-
-def test_a_path_is_saved_and_loaded_and_other_files_are_kept(path_app, tmp_path):
-    app, path, viewer = path_app, path_app.state.path, path_app.viewer
-    walk, own = str(tmp_path / "walk.json"), tmp_path / "own.json"
-    viewer.save_path(walk)
-    app.state.path = CameraPath()
-    viewer.open_path(walk)
-    assert app.state.path == path
-    viewer.save_path(walk)
-    assert viewer.error is None, "pansplat wrote the file"
+    viewer, walk, own = app.viewer, str(tmp_path / "walk.json"), tmp_path / "own.json"
+    for _ in range(2):
+        viewer.save_path(walk)
+        assert viewer.error is None, "pansplat wrote the file"
     own.write_text("{}")
     for act, name in ((viewer.open_path, "missing.json"), (viewer.save_path, "own.json")):
         act(str(tmp_path / name))
@@ -592,20 +568,20 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
         return loaded
 
     app.load = load
-    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
+    app.session.show([SceneEntry(house.name, tour=house)], 0)
     app.until(
-        lambda: app.scenes.tour is not None and (app.scenes.tour.tour.poor or app.scenes.tour.tour.walls), "edges"
+        lambda: app.session.tour is not None and (app.session.tour.tour.poor or app.session.tour.tour.walls), "edges"
     )
-    tour, edges = app.scenes.tour, app.scenes.tour.tour
+    tour, edges = app.session.tour, app.session.tour.tour
     go.set()
     app.settle()
-    assert app.scenes.tour is tour and tour.tour is edges and app.viewer.error is None
+    assert app.session.tour is tour and tour.tour is edges and app.viewer.error is None
     assert tour.loaded == list(tour._sources)
 
 
 def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     app = make_app()
-    app.scenes.show([SceneEntry(house.name, tour=house)], 0, house.folder)
+    app.session.show([SceneEntry(house.name, tour=house)], 0, house.folder)
     app.settle()
     photographs, file = app.viewer.stage.photographs, house.folder / "links.json"
     app.state.camera = replace(app.state.camera, yaw_radians=0.4, pitch_radians=0.2)
@@ -629,36 +605,6 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     file.unlink()
 
 
-def test_a_note_is_added_to_what_the_file_states_by_now(make_app, house):
-    """Notes of before, of another window or by hand stay, also where poses were found since, or the key is another."""
-    app, file = make_app(), house.folder / "links.json"
-    first, *others = house.panoramas
-    first = replace(first, links_at=(file, ("room0.png", "room0"), ()))
-    entries = [SceneEntry("house", tour=replace(house, panoramas=(first, *others))), SceneEntry("other")]
-    posed = replace(house, panoramas=(replace(first), *others))  # as it was loaded, before any note
-    app.show(*entries)
-    app.viewer.put_note("one")
-    app.scenes.choose(1)
-    app.settle()
-    for shown in (entries[0], SceneEntry("house", tour=posed)):
-        app.show(shown)
-        index = app.viewer.stage.photographs.find_stop(np.asarray(app.state.camera.position))
-        assert app.viewer.stage.photographs.list_notes(index)[0].text == "one"
-        content = json.loads(file.read_text())
-        (entry,) = content.values()
-        entry["notes"].append({"yaw": 2.0 + len(entry["notes"]), "pitch": 0, "text": "by hand", "colour": "red"})
-        file.write_text(json.dumps({"room0": entry, "of the user": 1}))
-        app.state.camera = replace(app.state.camera, yaw_radians=app.state.camera.yaw_radians + 1)
-        app.viewer.put_note("more")
-        content = json.loads(file.read_text())
-        assert content.keys() == {"room0", "of the user"} and entry["notes"] == content.pop("room0")["notes"][:-1]
-        file.write_text(json.dumps({"room0": entry}))
-    file.unlink()
-    app.viewer.put_note("last")
-    assert [note["text"] for note in json.loads(file.read_text())["room0.png"]["notes"]] == ["last"]
-    file.unlink()
-
-
 def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_predictor, monkeypatch, house):
     """In the scene of a single photograph, and of two, also if it flew before the scene was there."""
     monkeypatch.setitem(pipeline.models._MODELS, "sphere", sphere_predictor)
@@ -667,7 +613,7 @@ def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_pre
         app = make_app()
         gate = Gate(lambda entry: load_entry(entry, options), "waiting", 0.0)
         app.load = gate
-        app.scenes.show([SceneEntry("room", pair=house.make_set(views))], 0)
+        app.session.show([SceneEntry("room", pair=house.make_set(views))], 0)
         for _ in range(20):
             app.frame(0.2, held=frozenset("w"))
         gate.open()
@@ -707,8 +653,8 @@ def test_hotspots_are_in_points_of_a_screen_with_two_pixels_a_point(tour_app):
 def test_a_flight_shows_photographs_where_no_scene_is_ready(make_app, house, load_house):
     app, gate = make_app(), Gate(load_house, "predicting", 0.5)
     app.load = lambda entry, *rest: gate(entry, *rest) if entry.views not in ((), (0, 1)) else load_house(entry)
-    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
-    app.until(lambda: app.scenes.loaded is not None, "tour")
+    app.session.show([SceneEntry(house.name, tour=house)], 0)
+    app.until(lambda: app.session.loaded is not None, "tour")
     first, contents = app.viewer.stage.slot.scene, []
     app.press("4")
 
@@ -725,13 +671,13 @@ def test_a_flight_shows_photographs_where_no_scene_is_ready(make_app, house, loa
     gate.open()
     app.until(lambda: app.viewer.stage.photograph is None, "scene")
     app.settle()
-    assert app.viewer.stage.slot.scene is app.scenes.tour.get((2, 3)).scene
+    assert app.viewer.stage.slot.scene is app.session.tour.get((2, 3)).scene
 
 
 def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, load_house):
     app, gate = make_app(), Gate(load_house, "predicting", 0.5)
     app.load = lambda entry, *rest: load_house(entry) if entry.views else gate(entry, *rest)
-    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
+    app.session.show([SceneEntry(house.name, tour=house)], 0)
     app.frame()
     assert app.content == 0 and app.state.camera.yaw_radians == 0, "towards its neighbour"
     app.press("3")
@@ -741,7 +687,7 @@ def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, lo
     app.press("space")
     app.frames(5, 1 / 10)
     gate.open()
-    app.until(lambda: app.scenes.loaded is not None, "first scene", 1e-3)
+    app.until(lambda: app.session.loaded is not None, "first scene", 1e-3)
     assert app.state.playing, "the flight goes on"
     assert app.content == 2, "the scene of panoramas 0 and 1 is not shown from here"
     app.until(lambda: app.viewer.stage.photograph is None, "scene", 1 / 10)
@@ -749,7 +695,7 @@ def test_a_tour_shows_its_photographs_before_the_first_scene(make_app, house, lo
 
 
 def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, house, monkeypatch):
-    monkeypatch.setattr("pansplat_viewer.scene.tour._MEMORY", 0)
+    monkeypatch.setattr("pansplat_viewer.core.tour_scenes._MEMORY", 0)
     app = make_app()
     app.show(SceneEntry(house.name, tour=house))
     app.press("space")
@@ -757,7 +703,7 @@ def test_space_plays_the_tour_through_all_panoramas_within_the_memory(make_app, 
 
     def has_ended() -> bool:
         visited.add(app.node)
-        assert len(app.scenes.tour.loaded) <= 3, "a scene, that of the camera and the one before"
+        assert len(app.session.tour.loaded) <= 3, "a scene, that of the camera and the one before"
         return not app.state.playing
 
     app.until(has_ended, "end of the tour", 1 / 4)
@@ -784,16 +730,16 @@ def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(m
     notes = ("room3.png: no pose was found; it is a part of its own",)
     app = make_app()
     app.show(SceneEntry(parted_house.name, tour=parted_house, notes=notes))
-    assert app.scenes.notes == notes
+    assert app.session.notes == notes
     app.state.target = 2
     app.fly(1.0)
     app.state.camera = replace(app.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
     app.frames(2)
-    (spot,) = app.viewer.hotspots
+    (spot,) = [spot for spot in app.viewer.hotspots if not spot.is_arrow]
     assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
     left, stage = app.viewer.stage.slot.scene, app.viewer.stage
     click_on(app, 3)
-    app.until(lambda: app.scenes.tour.part == 1, "fade", 0.2)
+    app.until(lambda: app.session.tour.part == 1, "fade", 0.2)
     poses, front = stage.fade.poses, stage.fade.front
     assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 1e-6, "the scene before stays"
     assert np.allclose(poses[front], app.state.camera.cam2world) and stage.slots[1 - front].scene is left
@@ -813,22 +759,22 @@ def test_a_scene_that_is_chosen_in_a_tour_stays_while_it_is_prepared(tour_app, l
         requested.append(entry.name)
         return LoadedScene(entry, small_scene) if entry.tour is None else load_house(entry)
 
-    next(life for life in app.scenes.tour._lives.values() if life.loaded).drop()  # one is missing
+    next(each for each in app.session.tour._predictions.values() if each.loaded).drop()  # one is missing
     is_ready = app.viewer.stage.preparer.is_ready
     monkeypatch.setattr(
         app.viewer.stage.preparer,
         "is_ready",
         lambda scene: is_ready(scene) and (scene is not small_scene or ready.is_set()),
     )
-    app.scenes.loader.cancel()
+    app.session.loader.cancel()
     app.load = load
-    app.scenes.show([SceneEntry("large")], 0)
+    app.session.show([SceneEntry("large")], 0)
     app.until(lambda: requested, "request")
     app.frames(5)
     ready.set()
     app.settle()
     assert requested == ["large"], "the tour requests nothing"
-    assert app.scenes.loaded.entry.name == "large" and app.scenes.tour is None
+    assert app.session.loaded.entry.name == "large" and app.session.tour is None
 
 
 def test_a_scene_of_a_tour_that_fails_is_reported_once(make_app, house, load_house):
@@ -841,7 +787,7 @@ def test_a_scene_of_a_tour_that_fails_is_reported_once(make_app, house, load_hou
         return load_house(entry)
 
     app.load = load
-    app.scenes.show([SceneEntry(house.name, tour=house)], 0)
+    app.session.show([SceneEntry(house.name, tour=house)], 0)
     app.until(lambda: app.viewer.error, "error")
     app.viewer.error = None
     app.settle()
@@ -856,6 +802,6 @@ def test_a_scene_after_a_tour_does_not_fade_from_it(tour_app, pair):
     app = tour_app
     app.state.target = 3
     app.fly(1.0)
-    app.scenes.show([SceneEntry("first", pair=pair)], 0)
-    app.until(lambda: app.scenes.tour is None, "pair")
+    app.session.show([SceneEntry("first", pair=pair)], 0)
+    app.until(lambda: app.session.tour is None, "pair")
     assert app.viewer.stage.fade.compute_weight(app.now) == 1

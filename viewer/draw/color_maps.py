@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-SIZE = 256
+SIZE = 256  # number of colours of a map
 
 
 @functools.cache

@@ -6,10 +6,9 @@ read from cube faces that are kept for the position.
 
 from __future__ import annotations
 
-import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import Future, TimeoutError
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -19,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt32
 
-from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.rendering.cpu.display import (
@@ -28,7 +26,6 @@ from pansplat.rendering.cpu.display import (
     DisplayScene,
     Layers,
     PixelFaces,
-    Selection,
     blend_layers,
     blend_to_pixels,
 )
@@ -37,24 +34,24 @@ from pansplat.rendering.cpu.tiling import LARGEST_SIDE
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.system.devices import say_detail
 from pansplat.system.kernels import checking_each_item, pooled_empty
+from pansplat_viewer.core.background import BackgroundWorker, Report
+from pansplat_viewer.core.camera import Pinhole
+from pansplat_viewer.core.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
-from pansplat_viewer.draw.splats import Splats, drop_not_finite
-from pansplat_viewer.scene.background import BackgroundWorker, Report
-from pansplat_viewer.scene.camera import Pinhole
-from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats, RendererChoice
+from pansplat_viewer.draw.frames import Frame, choose_layer_weights
+from pansplat_viewer.draw.splats import Splats, drop_not_finite, select_in_view
 
 if TYPE_CHECKING:
     import moderngl
 
     from pansplat_viewer.draw.renderer import SplatRenderer
 
-_MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
+_MIN_WEIGHT = 2.0**-26  # least weight of a view in deferred blending, as in OpenGL with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
-_MAX_FACE_SETS = 5
-_MAX_SELECTIONS = 8
-_MAX_TEXTURES = 4
+_MAX_FACE_SETS = 5  # positions whose cube faces are kept; the oldest set goes
+_MAX_SELECTIONS = 8  # selections of levels and views that are kept, a byte or two a Gaussian each
+_MAX_TEXTURES = 4  # textures of different sizes that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +67,7 @@ class _Groups:
     """The sets of Gaussians that the layers show."""
 
     labels: Int[np.ndarray, "n"]  # layer of each Gaussian, or `NO_LAYER`
-    weights: Float[np.ndarray, "layer"]  # of the layers
+    weights: Float[np.ndarray, "layer"]  # weight of each layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +90,7 @@ class _FaceSet:
     """Cube faces of one position and settings, and those that are finished."""
 
     faces: PixelFaces
-    groups: _Groups  # of the first frame, in whose direction the weights are chosen
+    groups: _Groups  # its weights are chosen in the direction of the first frame
     done: set[int] = field(default_factory=set)
 
     def find_missing(self, frame: Frame) -> list[int]:
@@ -152,11 +149,10 @@ class CpuRenderer:
         self._stop()
         prepared = prepared or self.prepare(scene)
         self._splats, self._scene = prepared.splats, prepared.scene
-        splats = prepared.splats
         self._groups.clear()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
-        self.stats = FrameStats(total=len(splats))
+        self.stats = FrameStats()
 
     def render(
         self,
@@ -175,7 +171,7 @@ class CpuRenderer:
                 f"the image needs {largest} pixels a side, the limit is {LARGEST_SIDE}; use a smaller size"
             )
         groups = self._choose_groups(frame)
-        if frame.storage == LayerStorage.PADDED_FACES:
+        if frame.has_faces:
             return self._show(self._read_from_faces(frame, groups))
         key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.full_size, settings)
         if self._pending != key:
@@ -198,7 +194,7 @@ class CpuRenderer:
     def has_faces(self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings) -> bool:
         """Whether the cube faces that the camera reads are finished."""
         frame = self._create_cached_frame(cam2world, size, settings)
-        if frame.storage != LayerStorage.PADDED_FACES:
+        if not frame.has_faces:
             return False
         stored = self._faces.get(_face_key(frame))
         return stored is not None and not stored.find_missing(frame)
@@ -208,17 +204,11 @@ class CpuRenderer:
         if self._worker.future is not None and not self._worker.future.done():
             return
         frame = self._create_cached_frame(cam2world, size, settings)
-        if frame.storage != LayerStorage.PADDED_FACES:
+        if not frame.has_faces:
             return
         stored = self._find_face_set(frame)
-        faces = [face for face in dict.fromkeys([*stored.find_missing(frame), *range(6)]) if face not in stored.done]
-
-        def draw() -> None:
-            for face in faces:
-                self._draw_face(frame, stored, face)
-
-        if faces:
-            self._start(draw)
+        if len(stored.done) < 6:
+            self._start(lambda: self._draw_faces(frame, stored, [*stored.find_missing(frame), *range(6)]))
 
     def _create_cached_frame(
         self, cam2world: Float[np.ndarray, "4 4"], size: tuple[int, int], settings: DrawSettings
@@ -281,10 +271,9 @@ class CpuRenderer:
     def _draw(self, frame: Frame, groups: _Groups) -> _Picture:
         """Draw the image of a frame."""
         start = time.perf_counter()
-        focal = frame.focal if frame.settings.layout == "pinhole" else 0.0
-        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), focal)
+        plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), frame.focal)
         layers = self._rasterize(frame, groups, plane)
-        sums, drawn = layers.sums, layers.statistics.visible
+        sums = layers.sums
         stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
@@ -292,17 +281,12 @@ class CpuRenderer:
         stages["blend"] = 1e3 * (time.perf_counter() - before)
         pixels = _enlarge(frame, pixels, stages)
         now = time.perf_counter()
-        stats = self._make_stats(frame, drawn, 1e3 * (now - start), stages)
-        return _Picture(frame, pixels, groups, sums, stats)
+        return _Picture(frame, pixels, groups, sums, _make_stats(1e3 * (now - start), stages))
 
     def _rasterize(self, frame: Frame, groups: _Groups, plane: ImagePlane) -> Layers:
-        """Rasterise the Gaussians in view of a plane; a panorama has a ray for each pixel."""
-        selection = None
-        if not plane.is_panorama:
-            camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
-            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle
-            deviation += math.hypot(*frame.settings.shift) / (math.sqrt(12) * frame.settings.near)
-            selection = Selection(camera.compute_side_normals(), deviation)
+        """Rasterise the Gaussians in view of a plane."""
+        camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
+        selection = select_in_view(camera, frame.settings.largest_blur)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
             plane,
@@ -329,32 +313,25 @@ class CpuRenderer:
         start = time.perf_counter()
         stored = self._find_face_set(frame)
         missing = stored.find_missing(frame)
-        drawn, stages = 0, {}
+        stages = {}
         if missing:
             self._stop()
-
-            def draw_missing() -> None:
-                nonlocal drawn
-                drawn = sum(self._draw_face(frame, stored, face) for face in missing)
-
-            self._start(draw_missing).result()
+            self._start(lambda: self._draw_faces(frame, stored, missing)).result()
             stages["faces"] = 1e3 * (time.perf_counter() - start)
         pixels = pooled_empty(frame.size[::-1], np.uint32)
         before = time.perf_counter()
         stored.faces.sample(frame.rotation, frame.focal, pixels, bottom_up=True)
         stages["sample"] = 1e3 * (time.perf_counter() - before)
         pixels = _enlarge(frame, pixels, stages)
-        stats = self._make_stats(frame, drawn, 1e3 * (time.perf_counter() - start), stages)
-        return _Picture(frame, pixels, None, None, replace(stats, cached=not missing))
+        return _Picture(frame, pixels, None, None, _make_stats(1e3 * (time.perf_counter() - start), stages))
 
-    def _draw_face(self, frame: Frame, stored: _FaceSet, face: int) -> int:
-        """Draw one face unless it is finished; returns the number of Gaussians."""
-        if face in stored.done:
-            return 0
-        layers = self._rasterize(frame, stored.groups, stored.faces.plane(face))
-        _write_pixels(frame.settings, stored.groups, layers.sums, stored.faces.pixels[face])
-        stored.done.add(face)
-        return layers.statistics.visible
+    def _draw_faces(self, frame: Frame, stored: _FaceSet, faces: Iterable[int]) -> None:
+        """Draw the faces that are not finished."""
+        for face in faces:
+            if face not in stored.done:
+                layers = self._rasterize(frame, stored.groups, stored.faces.plane(face))
+                _write_pixels(frame.settings, stored.groups, layers.sums, stored.faces.pixels[face])
+                stored.done.add(face)
 
     def _find_face_set(self, frame: Frame) -> _FaceSet:
         """The faces of a frame's position, settings and resolution; the least recently used set is dropped."""
@@ -367,16 +344,6 @@ class CpuRenderer:
         return self._faces[key]
 
     # --- results ---
-
-    def _make_stats(self, frame: Frame, drawn: int, frame_ms: float, stages: dict[str, float]) -> FrameStats:
-        return FrameStats(
-            total=self.stats.total,
-            drawn=drawn,
-            sort_ms=stages.get("sort", 0.0),
-            frame_ms=frame_ms,
-            stages=stages,
-            size=frame.size,
-        )
 
     def _show(self, picture: _Picture) -> moderngl.Texture | None:
         """Upload a picture and return its texture."""
@@ -437,6 +404,10 @@ def create_renderer(
 
     say_detail("drawing", f"by OpenGL, {ctx.info['GL_RENDERER']}")
     return SplatRenderer(ctx, color_bits=color_bits)
+
+
+def _make_stats(frame_ms: float, stages: dict[str, float]) -> FrameStats:
+    return FrameStats(sort_ms=stages.get("sort", 0.0), frame_ms=frame_ms, stages=stages)
 
 
 def _face_key(frame: Frame) -> Hashable:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
-from pansplat_viewer.scene.settings import DrawSettings, FrameStats
+from pansplat_viewer.core.settings import DrawSettings, FrameStats
 
 if TYPE_CHECKING:
     import moderngl
@@ -39,7 +39,7 @@ class FrameRenderer(Protocol):
 
     @property
     def stats(self) -> FrameStats:
-        """Counts and times of the last frame."""
+        """Times of the last frame."""
         ...
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 import torch
@@ -13,23 +12,11 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.geometry.pose import blend_weights
+from pansplat_viewer.core.camera import Pinhole, create_face_cameras, find_faces_in_view
+from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.draw.splats import SortedSplats, Splats
-from pansplat_viewer.scene.camera import Pinhole, create_face_cameras, find_faces_in_view
-from pansplat_viewer.scene.settings import DrawSettings
 
 _MAX_CACHED_FACE_SIZE = 2048  # pixels; six faces take 200 MB at 16 bits
-
-
-class LayerStorage(IntEnum):
-    """How a layer is stored; the constant LAYER_STORAGE of shaders/accumulate.frag.
-
-    IMAGE is one image of the frame's size. PADDED_FACES are six cube faces with one extra pixel on each side, which
-    the texture unit can filter. FACES are six cube faces without border, interpolated in float32 by the shader.
-    """
-
-    IMAGE = 0
-    PADDED_FACES = 1
-    FACES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,35 +44,20 @@ class Frame:
         return Frame(cam2world[:3, :3], position, cam2world[:3, 3], drawn, settings, (width, height))
 
     @property
-    def storage(self) -> LayerStorage:
-        """How this frame's layers are stored."""
-        if self.settings.layout == "equirect":
-            return LayerStorage.FACES
-        if self.settings.cached and self.face_size <= _MAX_CACHED_FACE_SIZE:
-            return LayerStorage.PADDED_FACES
-        return LayerStorage.IMAGE
+    def has_faces(self) -> bool:
+        """Whether layers are six cube faces, each with one extra pixel on each side, which the texture unit can filter;
+        else one image of the frame's size."""
+        return self.settings.cached and self.face_size <= _MAX_CACHED_FACE_SIZE
 
     @property
     def focal(self) -> float:
-        """Focal length of a pinhole image, pixels."""
+        """Focal length, pixels."""
         return 0.5 * self.size[1] / math.tan(0.5 * math.radians(self.settings.vertical_fov_degrees))
 
     @property
     def face_size(self) -> int:
-        """Side of a cube face without border, pixels: the resolution of the equator, or of the image's centre."""
-        if self.settings.layout == "equirect":
-            return max(round(2 * self.size[1] / math.pi), 1)
+        """Side of a cube face without border, pixels: the resolution of the image's centre."""
         return max(math.ceil(2 * self.focal), 1)
-
-    @property
-    def faces_to_world(self) -> Float[np.ndarray, "3 3"]:
-        """Axes of the cube: those of the panorama camera, or of the world for faces that serve every rotation."""
-        return self.rotation if self.settings.layout == "equirect" else np.eye(3)
-
-    @property
-    def camera_to_faces(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation from the camera's axes to the cube's."""
-        return self.faces_to_world.T @ self.rotation
 
     @property
     def _pinhole(self) -> Pinhole:
@@ -93,26 +65,17 @@ class Frame:
 
     def create_layer_cameras(self) -> list[Pinhole]:
         """Return the cameras of a layer's parts: one, or one for each cube face."""
-        if self.storage == LayerStorage.IMAGE:
-            return [self._pinhole]
-        border = 1 if self.storage == LayerStorage.PADDED_FACES else 0
-        return create_face_cameras(self.faces_to_world, self.position, self.face_size, border)
+        return create_face_cameras(self.position, self.face_size, 1) if self.has_faces else [self._pinhole]
 
     def find_parts_in_view(self) -> list[int]:
         """Return the indices of the layer parts that the frame reads."""
-        if self.storage == LayerStorage.IMAGE:
-            return [0]
-        if self.storage == LayerStorage.FACES:
-            return list(range(6))
-        return find_faces_in_view(self.camera_to_faces, self._pinhole.half_size)
+        return find_faces_in_view(self.rotation, self._pinhole.half_size) if self.has_faces else [0]
 
     def create_layer_key(self, splats: SortedSplats) -> tuple[Hashable, ...]:
         """Return the values that a layer's content depends on, except its set of Gaussians."""
         s = self.settings
         key = (splats, self.position, s.levels, s.near, s.shift, s.splat_colors)
-        if self.storage == LayerStorage.IMAGE:
-            return (*key, self.rotation.tobytes(), self.focal)
-        return (*key, self.faces_to_world.tobytes())
+        return key if self.has_faces else (*key, self.rotation.tobytes(), self.focal)
 
 
 def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dict[int | None, float]:
@@ -133,6 +96,6 @@ def choose_layer_weights(frame: Frame, splats: Splats, min_weight: float) -> dic
             f"mode deferred needs the camera of each context view, the scene has {len(positions)} cameras "
             f"for {num_views} views; use mode joint"
         )
-    forward = torch.from_numpy(frame.rotation[:, 2].astype(np.float64)) if settings.layout == "pinhole" else None
+    forward = torch.from_numpy(frame.rotation[:, 2].astype(np.float64))
     weights = blend_weights(torch.from_numpy(frame.world_position.copy()), torch.from_numpy(positions), forward)
     return {view: max(weight, min_weight) for view, weight in enumerate(weights.tolist())}

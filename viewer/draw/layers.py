@@ -9,21 +9,19 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass
 
 import moderngl
 import numpy as np
 from jaxtyping import Bool, Float, UInt
 
-from pansplat.constants import FILTER_VARIANCE
 from pansplat.errors import InputError
-from pansplat_viewer.draw.frames import Frame, LayerStorage
+from pansplat_viewer.core.camera import Pinhole
+from pansplat_viewer.core.settings import DrawSettings
+from pansplat_viewer.draw.frames import Frame
 from pansplat_viewer.draw.programs import RECORD, RECORD_BYTES, Programs, Resources, checking_memory, set_uniforms
 from pansplat_viewer.draw.splats import SortedSplats, Splats
-from pansplat_viewer.scene.camera import Pinhole
-from pansplat_viewer.scene.settings import DrawSettings
 
-_MAX_SELECTIONS = 8
+_MAX_SELECTIONS = 8  # masks of levels and views that are kept, a byte a Gaussian each
 _CHUNK_SIZE = 1 << 20  # records that are made and drawn together; limits their memory to 100 MB
 
 Viewport = tuple[int, int, int, int]  # left, bottom, width, height, pixels
@@ -135,15 +133,6 @@ class TargetStore:
         self._targets.clear()
 
 
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """The premultiplied image of one set of Gaussians, and the work that it took in this frame."""
-
-    target: Target
-    drawn: int  # number of splats drawn for this frame
-    cached: bool  # whether all parts in view were valid before
-
-
 class LayerPainter:
     """Draws the layers of one scene and keeps them in a target store."""
 
@@ -154,14 +143,14 @@ class LayerPainter:
         self._selections: dict[Hashable, Bool[np.ndarray, "n"]] = {}
         self.rasterizer = SplatRasterizer(ctx, programs, splats)
 
-    def paint(self, frame: Frame, splats: SortedSplats, view: int | None, *, with_depth: bool) -> Layer:
+    def paint(self, frame: Frame, splats: SortedSplats, view: int | None, *, with_depth: bool) -> Target:
         """Return the layer of one view's Gaussians, or of all (None); draws the parts in view that are not valid."""
         selected = self._select(frame.settings, view)
         cameras = frame.create_layer_cameras()
         width, height = cameras[0].width, cameras[0].height
-        size = (width, height) if frame.storage == LayerStorage.IMAGE else (3 * width, 2 * height)
+        size = (3 * width, 2 * height) if frame.has_faces else (width, height)
         target = self._targets.get(
-            (frame.storage, view), size, depth_components=int(with_depth), key=frame.create_layer_key(splats)
+            (frame.has_faces, view), size, depth_components=int(with_depth), key=frame.create_layer_key(splats)
         )
         missing = [part for part in frame.find_parts_in_view() if part not in target.parts]
         places = {part: (part % 3 * width, part // 3 * height, width, height) for part in missing}
@@ -170,12 +159,11 @@ class LayerPainter:
             target.framebuffer.viewport = target.framebuffer.scissor = place
             target.framebuffer.clear(0.0, 0.0, 0.0, 0.0)
         target.framebuffer.scissor = None
-        drawn = 0
         for part, place in places.items():
             target.framebuffer.viewport = place
-            drawn += self.rasterizer.draw(cameras[part], place, splats, selected, frame.settings)
+            self.rasterizer.draw(cameras[part], place, splats, selected, frame.settings)
         target.parts.update(missing)
-        return Layer(target, drawn, cached=not missing)
+        return target
 
     def release(self) -> None:
         """Free the splats on the GPU."""
@@ -188,11 +176,6 @@ class LayerPainter:
                 self._selections.clear()
             self._selections[key] = self._splats.select(*key)
         return self._selections[key]
-
-
-def compute_filter_variance(focal: float) -> float:
-    """Variance of the low-pass filter (docs/rendering.md, section 2), in image-plane units squared."""
-    return FILTER_VARIANCE / (focal * focal)
 
 
 class SplatRasterizer:
@@ -248,34 +231,25 @@ class SplatRasterizer:
         splats: SortedSplats,
         selected: Bool[np.ndarray, "n"],
         settings: DrawSettings,
-    ) -> int:
-        """Blend the selected splats that a camera sees into the framebuffer in use, whose viewport is `place`.
-
-        Returns:
-            The number of splats.
-        """
+    ) -> None:
+        """Blend the selected splats that a camera sees into the framebuffer in use, whose viewport is `place`."""
         self._set_uniforms(camera, place, settings)
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-        widening = math.sqrt(compute_filter_variance(camera.focal)) + math.hypot(*settings.shift) / (
-            math.sqrt(12) * settings.near
-        )
-        drawn = self._draw_in_order(splats.find_back_to_front(camera, selected, widening**2))
+        self._draw_in_order(splats.find_back_to_front(camera, selected, settings.largest_blur))
         self._ctx.enable_only(moderngl.NOTHING)
-        return drawn
 
     def release(self) -> None:
         """Free the buffers and vertex arrays."""
         self._resources.release()
 
-    def _draw_in_order(self, back_to_front: UInt[np.ndarray, "n"]) -> int:
-        """Project the splats with these indices by transform feedback, and draw them; returns their number."""
+    def _draw_in_order(self, back_to_front: UInt[np.ndarray, "n"]) -> None:
+        """Project the splats with these indices by transform feedback, and draw them."""
         for start in range(0, len(back_to_front), self._capacity):
             indices = np.ascontiguousarray(back_to_front[start : start + self._capacity], dtype=np.uint32)
             self._indices.write(indices)
             self._points.transform(self._records, moderngl.POINTS, vertices=len(indices))
             self._quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(indices))
-        return len(back_to_front)
 
     def _set_uniforms(self, camera: Pinhole, place: Viewport, settings: DrawSettings) -> None:
         set_uniforms(
@@ -284,7 +258,7 @@ class SplatRasterizer:
             world_to_camera=np.ascontiguousarray(camera.rotation, dtype=np.float32).tobytes(),
             position=camera.position,
             near=settings.near,
-            filter_variance=compute_filter_variance(camera.focal),
+            filter_variance=camera.filter_deviation**2,
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
             shift=tuple((camera.rotation.T @ settings.shift / math.sqrt(12)).tolist()),

@@ -15,7 +15,7 @@ from pansplat.shaders import load_shader
 RECORD = ("quad_1", "quad_2", "row_a", "row_b", "row_l", "color")
 RECORD_BYTES = 16 * len(RECORD)
 _UNIFORM = re.compile(r"^uniform \w+ (\w+)", re.MULTILINE)
-_MAX_ERRORS = 8  # that OpenGL can report at once
+_MAX_ERRORS = 8  # largest number of errors that OpenGL reports at once
 
 
 def read_source(name: str, **defines: float | str) -> str:
@@ -106,9 +106,9 @@ class Programs:
         """The program that draws records into a layer."""
         return self._compile_pair("splat.vert", "splat.frag")
 
-    def accumulate(self, storage: int) -> moderngl.Program:
-        """One weighted layer to the sum of layers; `storage` is a `LayerStorage`."""
-        return self._compile_pair("screen.vert", "accumulate.frag", LAYER_STORAGE=int(storage))
+    def accumulate(self, has_faces: bool) -> moderngl.Program:
+        """One weighted layer, an image or cube faces, to the sum of layers."""
+        return self._compile_pair("screen.vert", "accumulate.frag", LAYER_STORAGE=int(has_faces))
 
     def resolve(self) -> moderngl.Program:
         """The sum of layers to the image."""

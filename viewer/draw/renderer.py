@@ -1,4 +1,4 @@
-"""Draws a scene's Gaussians with OpenGL into a texture: any pose, pinhole or panorama, any blending mode.
+"""Draws a scene's Gaussians with OpenGL into a texture: any pose and blending mode.
 
 Needs no window. All calls must come from the thread of the context. `SplatRenderer._draw` has the data flow of a frame:
 the splats are painted into layers (one for each set of Gaussians), and the layers are composed to the image.
@@ -19,14 +19,15 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
+from pansplat_viewer.core.background import BackgroundWorker
+from pansplat_viewer.core.settings import SCALAR_MAPS, DrawSettings, FrameStats
 from pansplat_viewer.draw.color_maps import get_table
 from pansplat_viewer.draw.frame_renderer import Pacing
-from pansplat_viewer.draw.frames import Frame, LayerStorage, choose_layer_weights
-from pansplat_viewer.draw.layers import Layer, LayerPainter, Target, TargetStore
+from pansplat_viewer.draw.frames import Frame, choose_layer_weights
+from pansplat_viewer.draw.layers import LayerPainter, Target, TargetStore
 from pansplat_viewer.draw.programs import Programs, set_uniforms
 from pansplat_viewer.draw.resolution import BUDGET_MS, SETTLE_AFTER
-from pansplat_viewer.draw.splats import SortedSplats, Splats, SplatSorter, sort_splats
-from pansplat_viewer.scene.settings import SCALAR_MAPS, DrawSettings, FrameStats
+from pansplat_viewer.draw.splats import SortedSplats, Splats, sort_splats
 
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 
@@ -40,7 +41,7 @@ def is_software(ctx: moderngl.Context) -> bool:
     return any(name in ctx.info["GL_RENDERER"].lower() for name in _SOFTWARE)
 
 
-_COLOR_MAP_UNIT = 8  # texture unit, after those of the layers
+_COLOR_MAP_UNIT = 8  # the texture unit of the colour map; layers have those before it
 
 
 class SplatRenderer:
@@ -49,7 +50,7 @@ class SplatRenderer:
     Each call leaves blending disabled and restores the framebuffer binding.
 
     Attributes:
-        stats: counts and times of the last frame.
+        stats: times of the last frame.
     """
 
     pending: Future[Any] | None = None  # nothing is drawn in the background
@@ -65,14 +66,12 @@ class SplatRenderer:
         """
         if color_bits is None:
             color_bits = 32 if is_software(ctx) else 16
-        if color_bits not in (16, 32):
-            raise InputError(f"`color_bits` must be 16 or 32, got {color_bits}")
         self.stats = FrameStats()
         self._ctx = ctx
         self._programs = Programs(ctx)
         self._targets = TargetStore(ctx, color_bits=color_bits)
         self._compositor = Compositor(ctx, self._programs, self._targets)
-        self._sorter = SplatSorter()
+        self._sorter: BackgroundWorker[SortedSplats] = BackgroundWorker("splat-sorter")
         self._splats: Splats | None = None
         self._painter: LayerPainter | None = None
         self._sorted: SortedSplats | None = None
@@ -110,7 +109,7 @@ class SplatRenderer:
     def _show(self, splats: Splats, painter: LayerPainter) -> None:
         self._splats, self._painter = splats, painter
         self._unread = None
-        self.stats = FrameStats(total=len(splats))
+        self.stats = FrameStats()
 
     def render(
         self,
@@ -137,7 +136,8 @@ class SplatRenderer:
         bind(bound)
         self._unread = settings, 1e3 * (time.perf_counter() - start)
         known = self._read_times() if waits else before
-        self.stats = dataclasses.replace(self.stats, settled=settled, frame_ms=known.frame_ms, timed=known.timed)
+        sort_ms = 0.0 if self._sorted is None else self._sorted.milliseconds
+        self.stats = dataclasses.replace(known, settled=settled, sort_ms=sort_ms)
         return image.color
 
     def _read_times(self) -> FrameStats:
@@ -169,9 +169,8 @@ class SplatRenderer:
         `render` draws no depth. The first call after it draws the frame again with depth.
         """
         if self._image is not None and self._frame is not None and self._image.depth is None:
-            bound, stats = self._ctx.fbo, self.stats
+            bound = self._ctx.fbo
             self._draw(self._frame, with_depth=True)
-            self.stats = stats
             bind(bound)
         return self._read(attachment=1, components=1)[..., 0]
 
@@ -194,13 +193,6 @@ class SplatRenderer:
         weighted = list(zip(layers, weights.values(), strict=True))
         self._image = self._compositor.compose(frame, weighted, with_depth=with_depth)
         self._targets.trim()
-        self.stats = FrameStats(
-            total=len(splats.splats),
-            drawn=sum(layer.drawn for layer in layers),
-            sort_ms=splats.milliseconds,
-            cached=all(layer.cached for layer in layers),
-            size=frame.size,
-        )
         return self._image
 
     def _update_order(self, position: tuple[float, float, float], wait: bool) -> bool:
@@ -209,12 +201,13 @@ class SplatRenderer:
         if self._sorted is None or (wait and self._sorted.position != position):
             self._sorted = sort_splats(self._splats, position)
         elif self._sorted.position != position:
-            ready = self._sorter.take()
-            if ready is not None and ready.splats is self._splats:
+            ready, splats = self._sorter.poll(), self._splats
+            if isinstance(ready, BaseException):
+                raise ready
+            if ready is not None and ready.splats is splats:
                 self._sorted = ready
-            if self._sorted.position != position:
-                self._sorter.request(self._splats, position)
-        assert self._sorted is not None
+            if self._sorted.position != position and self._sorter.future is None:
+                self._sorter.start(lambda _: sort_splats(splats, position))
         return self._sorted.position == position
 
     def _write_colors(self, splats: SortedSplats, display: str) -> None:
@@ -249,11 +242,11 @@ class Compositor:
         self._ctx = ctx
         self._programs = programs
         self._targets = targets
-        self._accumulate: dict[LayerStorage, moderngl.VertexArray] = {}
+        self._accumulate: dict[bool, moderngl.VertexArray] = {}
         self._resolve = ctx.vertex_array(programs.resolve(), [])
         self._tables: dict[str, moderngl.Texture] = {}
 
-    def compose(self, frame: Frame, weighted: Sequence[tuple[Layer, float]], *, with_depth: bool) -> Target:
+    def compose(self, frame: Frame, weighted: Sequence[tuple[Target, float]], *, with_depth: bool) -> Target:
         """Return the frame's image: RGB over the background, coverage, and depth if the layers have it.
 
         Args:
@@ -289,19 +282,19 @@ class Compositor:
             self._tables[name] = _create_table_texture(self._ctx, name)
         self._tables[name].use(_COLOR_MAP_UNIT)
 
-    def _add_layers(self, frame: Frame, weighted: Sequence[tuple[Layer, float]], with_depth: bool) -> Target:
+    def _add_layers(self, frame: Frame, weighted: Sequence[tuple[Target, float]], with_depth: bool) -> Target:
         target = self._targets.get("sum", frame.size, depth_components=2)
         target.framebuffer.use()
         target.framebuffer.viewport = (0, 0, *frame.size)
-        program = self._programs.accumulate(frame.storage)
-        if frame.storage not in self._accumulate:
-            self._accumulate[frame.storage] = self._ctx.vertex_array(program, [])
+        program = self._programs.accumulate(frame.has_faces)
+        if frame.has_faces not in self._accumulate:
+            self._accumulate[frame.has_faces] = self._ctx.vertex_array(program, [])
         set_uniforms(
             program,
             with_depth=with_depth,
             size=frame.size,
             focal=frame.focal,
-            camera_to_faces=np.ascontiguousarray(frame.camera_to_faces.T, dtype=np.float32).tobytes(),
+            camera_to_faces=np.ascontiguousarray(frame.rotation.T, dtype=np.float32).tobytes(),
             face_size=frame.face_size,
         )
         self._ctx.enable_only(moderngl.NOTHING)  # the first layer overwrites the target, the others are added
@@ -309,8 +302,8 @@ class Compositor:
         self._ctx.blend_equation = moderngl.FUNC_ADD, moderngl.MAX
         for layer, weight in weighted:
             set_uniforms(program, weight=weight)
-            self._bind_textures(program, layer_color=layer.target.color, layer_depth=layer.target.depth)
-            self._accumulate[frame.storage].render(moderngl.TRIANGLES, vertices=3)
+            self._bind_textures(program, layer_color=layer.color, layer_depth=layer.depth)
+            self._accumulate[frame.has_faces].render(moderngl.TRIANGLES, vertices=3)
             self._ctx.enable_only(moderngl.BLEND)
         self._ctx.enable_only(moderngl.NOTHING)
         self._ctx.blend_equation = moderngl.FUNC_ADD

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)  # few values, because a new size allocates new GL textures
-BUDGET_MS = 50.0
-SETTLE_AFTER = 0.2  # seconds after the last movement
+SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)  # of an image along each side; few, because a new size allocates new textures
+BUDGET_MS = 50.0  # longest time of a frame while the camera moves: 20 frames a second are still smooth
+SETTLE_AFTER = 0.2  # time from the last movement to the image at full resolution, seconds
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,12 @@
 """A scene's Gaussians on the CPU: arrays, colours, sort order, selection and culling.
 
-Colours and radial order depend on the position of the camera and not on its rotation. `SplatSorter` computes both in
-a worker thread.
+Colours and radial order depend on the position of the camera and not on its rotation (`sort_splats`).
 """
 
 import functools
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,8 +19,8 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.rendering.cpu.display import NO_LAYER, Selection, mark_in_view
 from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat.system.kernels import parallel_for_slices
+from pansplat_viewer.core.camera import Pinhole
 from pansplat_viewer.draw.color_maps import color_by_label
-from pansplat_viewer.scene.camera import Pinhole
 
 # Gaussians whose harmonics are evaluated together. Fits the cache, and is below the size at which torch starts threads,
 # which would cost more time than it saves.
@@ -182,16 +180,21 @@ class SortedSplats:
     milliseconds: float = 0.0  # time of sorting and colours
 
     def find_back_to_front(
-        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], filter_variance: float
+        self, camera: Pinhole, selected: Bool[np.ndarray, "n"], blur: float
     ) -> UInt[np.ndarray, "m"]:
         """Return the indices of the selected splats that can touch the camera's image, farthest first; conservative.
 
-        A splat is bounded by a ball of its reach, widened by the low-pass filter.
+        A splat is bounded by a ball of its reach, widened by the low-pass filter and the blur (radians).
         """
-        selection = Selection(camera.compute_side_normals(), math.sqrt(filter_variance))
+        selection = select_in_view(camera, blur)
         labels = np.where(selected, np.int16(0), np.int16(NO_LAYER))
         _, marks, _ = mark_in_view(self.splats.balls, np.asarray(camera.position), selection, labels)
         return self.order[(marks != NO_LAYER)[self.order]][::-1]
+
+
+def select_in_view(camera: Pinhole, blur: float) -> Selection:
+    """The directions that a camera sees, and how much low-pass filter and blur (radians) widen Gaussians at most."""
+    return Selection(camera.compute_side_normals(), camera.filter_deviation + blur)
 
 
 def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedSplats:
@@ -205,27 +208,3 @@ def sort_splats(splats: Splats, position: tuple[float, float, float]) -> SortedS
     colors = splats.evaluate_colors(position) if splats.base_colors is None else None
     milliseconds = 1e3 * (time.perf_counter() - start)
     return SortedSplats(splats, position, order, colors, milliseconds)
-
-
-class SplatSorter:
-    """Runs `sort_splats` in a worker thread; a new request replaces one that has not started."""
-
-    def __init__(self) -> None:
-        """Create the sorter; the thread starts with the first request."""
-        self._executor = ThreadPoolExecutor(1, "splat-sorter")
-        self._futures: list[Future[SortedSplats]] = []
-
-    def request(self, splats: Splats, position: tuple[float, float, float]) -> None:
-        """Queue a sort and return at once."""
-        self._futures = [future for future in self._futures if not future.cancel()]
-        self._futures.append(self._executor.submit(sort_splats, splats, position))
-
-    def take(self) -> SortedSplats | None:
-        """Return the newest result once, else None; raises the exception of a sort that failed."""
-        done = [future for future in self._futures if future.done()]
-        self._futures = [future for future in self._futures if future not in done]
-        return done[-1].result() if done else None
-
-    def close(self) -> None:
-        """Stop the thread and wait for it."""
-        self._executor.shutdown(cancel_futures=True)

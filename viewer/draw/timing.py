@@ -3,7 +3,7 @@
 `pansplat bench viewer` runs this command, because no other package may import the viewer. Needs no window. A job is
 
     {"scene": "scene.ply", "pose": 4x4 cam2world, "size": [width, height], "repeats": 5, "folder": "images",
-     "renderers": ["gl", "cpu"], "settings": [{"layout": "equirect", ...}, ...]}
+     "renderers": ["gl", "cpu"], "settings": [{"mode": "joint", ...}, ...]}
 
 with the fields of `DrawSettings`, and optionally a "size" of its own. For each renderer and settings, one line of JSON
 is printed:
@@ -33,8 +33,8 @@ from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
 from pansplat_viewer.draw.renderer import DrawSettings, SplatRenderer
 
-_TURN_RADIANS = 5e-3  # between frames of a camera that turns
-_STEP = 1e-4  # metres that the camera moves between frames, so that no layer is reused
+_TURN_RADIANS = 5e-3  # angle between two frames of a camera that turns
+_STEP = 1e-4  # distance between two frames of a camera that moves, metres, so that no layer is reused
 
 
 def main() -> int:

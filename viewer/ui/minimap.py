@@ -18,15 +18,15 @@ from pansplat.system.descriptions import describe_count
 from pansplat.tours.floor import choose_camera_height, find_other_storeys
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
-from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.placing_by_hand import PlanView
+from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR
 
-SIZE = 210  # of the longer side of the plan, pixels at a DPI scale of 1
-_CLICK_PIXELS = 12.0
-_VIEW_LENGTH = 1.0  # metres, of the camera's field of view
-_PLAN_MARGIN = 0.5  # metres, around the panoramas and floors
-_DASH = 5.0  # pixels, of an outline
+SIZE = 210  # longer side of the plan, pixels at a DPI scale of 1
+_CLICK_PIXELS = 12.0  # distance from a panorama within which a click leads there, at a DPI scale of 1
+_VIEW_LENGTH = 1.0  # length of the lines that show the field of view, metres
+_DASH = 5.0  # length of a dash of an outline, pixels at a DPI scale of 1
 
 Color = tuple[float, float, float, float]
 
@@ -47,21 +47,21 @@ _COLORS = (
 def describe_panorama(tour: TourGraph, node: int) -> str:
     """The label of a panorama, and how sure its place is."""
     label, placement = tour.panoramas[node].label, tour.panoramas[node].placement
+    if not any(map(tour.is_placed, range(len(tour)))):
+        return label
     if not tour.is_placed(node):
         return f"{label} ({'about here' if node in tour.approximate else 'not placed'})"
     return f"{label} (placed by hand)" if placement.state == "by hand" else label
 
 
 def describe_panoramas(tour: TourGraph) -> str:
-    """The number of panoramas with a known, approximate and no place, and of fades on poor flights."""
-    flights = sum(a != b for a, b in tour.overlaps) - len(tour.poor)
-    ways = f"; {describe_count(flights, 'flight')}, {describe_count(len(tour.poor), 'fade')}" if tour.poor else ""
+    """The number of panoramas, of several those with a known, approximate and no place."""
     alone = sum(not tour.is_placed(node) for node in range(len(tour)))
-    if not alone:
-        return f"{describe_count(len(tour), 'panorama')}{ways}"
+    if alone in (0, len(tour)):
+        return describe_count(len(tour), "panorama")
     about = len(tour.approximate)
     counts = (len(tour) - alone, "placed"), (about, "about here"), (alone - about, "not placed")
-    return ", ".join(f"{count} {name}" for count, name in counts if count or name == "placed") + ways
+    return ", ".join(f"{count} {name}" for count, name in counts if count)
 
 
 class Minimap:
@@ -85,20 +85,16 @@ class Minimap:
         floors = {n: self._move(n, outline.corners) for n, outline in scenes.outlines.items() if n not in dots}
         cameras = tour.positions @ tour.level_axes[:, (0, 2)]
         nodes = np.stack([self._move(node, place) for node, place in enumerate(cameras)])
-        places = np.concatenate([nodes, *floors.values()])
-        low, high = places.min(axis=0) - _PLAN_MARGIN, places.max(axis=0) + _PLAN_MARGIN
-        factor, corner = SIZE * scale / float((high - low).max()), imgui.get_cursor_screen_pos()
-
-        def to_pixels(places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-            """Pixels of places to the right and forward, metres."""
-            return (places - (low[0], high[1])) * (factor, -factor) + (corner.x, corner.y)
-
-        width, height = ((high - low) * factor).tolist()
+        corner, points = imgui.get_cursor_screen_pos(), np.concatenate([nodes, *floors.values()])
+        extent = np.ptp(points, axis=0) + 1.0  # metres
+        width, height = (SIZE * scale * extent / extent.max()).tolist()
+        view = PlanView.of_points(points, (width, height), (corner.x, corner.y))
+        to_pixels = view.to_pixels
         imgui.dummy((width, height))
         hovered = imgui.is_item_hovered()
         for is_other, colors in ((True, _FAINT_FLOORS), (False, _FLOORS)):
             shown = [node for node in floors if (node in others) == is_other and node not in self._drawn]
-            _draw_floors([to_pixels(floors[node]) for node in shown], colors, scale)
+            draw_floors([floors[node] for node in shown], view, colors, scale)
         for node in self._drawn.keys() & floors.keys():
             _draw_dashed(to_pixels(floors[node]), scale)
         self.nodes = [tuple(pixel) for pixel in to_pixels(nodes).tolist()]
@@ -173,11 +169,13 @@ def _draw_dashed(corners: Float[np.ndarray, "corner 2"], scale: float) -> None:
         canvas.add_line((first.x, first.y), (last.x, last.y), color, 1.5 * scale)
 
 
-def _draw_floors(floors: list[Float[np.ndarray, "corner 2"]], colors: tuple[Color, Color], scale: float) -> None:
+def draw_floors(
+    floors: list[Float[np.ndarray, "corner 2"]], view: PlanView, colors: tuple[Color, Color], scale: float
+) -> None:
     """Draw walls around all floors together: an outline that ends in another one's floor has no wall there."""
     canvas = imgui.get_window_draw_list()
     wall, floor = map(imgui.color_convert_float4_to_u32, colors)
-    shapes = [[imgui.ImVec2(x, y) for x, y in corners.tolist()] for corners in floors]
+    shapes = [[imgui.ImVec2(x, y) for x, y in view.to_pixels(corners).tolist()] for corners in floors]
     for shape in shapes:
         canvas.add_polyline(shape, wall, thickness=3.0 * scale, flags=imgui.ImDrawFlags_.closed.value)
     for shape in shapes:

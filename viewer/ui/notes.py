@@ -8,13 +8,13 @@ import numpy as np
 from imgui_bundle import imgui
 
 from pansplat.geometry.path import find_direction
-from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
+from pansplat_viewer.core.picking import project_point
+from pansplat_viewer.ui.widgets import Widgets
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-_RADIUS = 9.0  # of a mark, pixels at a DPI scale of 1
+_RADIUS = 9.0  # radius of a mark, pixels at a DPI scale of 1
 
 
 def draw_notes(viewer: Viewer) -> None:
@@ -50,11 +50,7 @@ class NotesSection:
         self._widgets, self._text = widgets, ""
 
     def draw(self, viewer: Viewer) -> None:
-        """Draw the field and the buttons, or what to do where there are none."""
-        photographs = viewer.stage.photographs
-        if photographs.find_stop(np.asarray(viewer.state.camera.position)) is None:
-            draw_wrapped("Go to a panorama to put a note there.", is_disabled=True)
-            return
+        """Draw the field and the buttons; they stay while the camera flies, so that what is below does not move."""
         self._text = self._widgets.text_field("note", self._text)
         if self._widgets.button("Put at the middle") and self._text.strip():
             viewer.queue(viewer.put_note, self._text)

@@ -6,14 +6,14 @@ import math
 
 from imgui_bundle import imgui
 
+from pansplat_viewer.core.hotspots import Hotspot
+from pansplat_viewer.core.picking import project_point
+from pansplat_viewer.core.settings import SCALAR_MAPS
+from pansplat_viewer.core.state import ViewerState
 from pansplat_viewer.draw.color_maps import get_table
-from pansplat_viewer.scene.hotspots import Hotspot
-from pansplat_viewer.scene.picking import project_point
-from pansplat_viewer.scene.settings import SCALAR_MAPS
-from pansplat_viewer.scene.state import ViewerState
 
-PANEL_WIDTH = 290.0  # of the main panel at first, pixels at a DPI scale of 1
-MARGIN = 10.0  # from the border of the window, pixels
+PANEL_WIDTH = 290.0  # width of the main panel before a user drags it, pixels at a DPI scale of 1
+MARGIN = 10.0  # distance of overlays from the border of the window, pixels
 FIXED = (  # flags of a window that is placed anew in each frame
     imgui.WindowFlags_.no_move.value | imgui.WindowFlags_.no_resize.value | imgui.WindowFlags_.no_saved_settings.value
 )
@@ -25,9 +25,9 @@ _LABEL = (
     | imgui.WindowFlags_.no_focus_on_appearing.value
     | imgui.WindowFlags_.no_nav.value
 )
-_LEGEND_WIDTH = 180.0
-FADE_COLOR = (1.0, 0.75, 0.3)  # of panoramas of other parts of a tour
-UNITS = {"depth": " m"}  # of displays whose range can be changed
+_LEGEND_WIDTH = 180.0  # pixels at a DPI scale of 1
+FADE_COLOR = (1.0, 0.75, 0.3)  # RGB of the marks of panoramas in other parts of a tour
+UNITS = {"depth": " m"}  # units of the displays whose range can be changed
 
 
 def draw_points(state: ViewerState) -> None:
@@ -50,16 +50,19 @@ def draw_points(state: ViewerState) -> None:
 
 
 def draw_hotspots(hotspots: list[Hotspot]) -> None:
-    """Draw a ring on the floor for each panorama, with its label; amber if the image fades to it."""
-    canvas = imgui.get_background_draw_list()
+    """Draw a ring on the floor for each panorama, or an arrow, with its label; amber if the image fades to it."""
+    canvas, right = imgui.get_background_draw_list(), imgui.get_io().display_size.x - MARGIN
     black, white, amber = (imgui.color_convert_float4_to_u32((*rgb, 0.8)) for rgb in ((0,) * 3, (1,) * 3, FADE_COLOR))
     for hotspot in hotspots:
         ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
         for color, thickness in ((black, 4.0), (amber if hotspot.is_fade else white, 2.0)):
             canvas.add_polyline(ring, color, thickness=thickness, flags=imgui.ImDrawFlags_.closed.value)
-            canvas.add_circle_filled(hotspot.center, 1.0 + thickness, color)
+            if hotspot.is_arrow:
+                canvas.add_convex_poly_filled(ring, color)
+            else:
+                canvas.add_circle_filled(hotspot.center, 1.0 + thickness, color)
         width = imgui.calc_text_size(hotspot.label).x
-        place = hotspot.center[0] - width / 2, hotspot.center[1] + hotspot.radius
+        place = min(hotspot.center[0] - width / 2, right - width), hotspot.center[1] + hotspot.radius
         _draw_outlined(canvas, place, white, hotspot.label)
 
 

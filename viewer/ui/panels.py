@@ -13,20 +13,19 @@ from typing import TYPE_CHECKING, get_args
 import moderngl
 from imgui_bundle import imgui
 
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.settings import Display
-from pansplat_viewer.scene.state import (
+from pansplat.tours.graph import TourGraph
+from pansplat_viewer.core.settings import Display
+from pansplat_viewer.core.state import (
     KEY_SECONDS,
     ViewerState,
     add_key_frame,
     choose_display,
-    fly_to,
-    jump_to_view,
+    go_to_view,
     make_key_frame,
     show_path,
     toggle_play,
 )
-from pansplat_viewer.scene.tour import TourScenes
+from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.ui.minimap import Minimap, describe_panorama, describe_panoramas
 from pansplat_viewer.ui.notes import NotesSection, draw_notes
 from pansplat_viewer.ui.overlays import (
@@ -39,14 +38,14 @@ from pansplat_viewer.ui.overlays import (
     draw_message,
     draw_points,
 )
-from pansplat_viewer.ui.placing import PlacingWindow, draw_photographs
+from pansplat_viewer.ui.placing_panel import PlacingWindow, draw_photographs
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 from pansplat_viewer.window.input import KEYS
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-_BAR_COLOR = (0.2, 0.4, 0.7, 1.0)  # of a progress that is behind a white text
+_BAR_COLOR = (0.2, 0.4, 0.7, 1.0)  # RGBA of a progress bar behind a white text
 _PANEL = imgui.WindowFlags_.no_title_bar.value | imgui.WindowFlags_.no_bring_to_front_on_focus.value
 
 
@@ -59,33 +58,34 @@ class Panels:
         minimap: the plan of a tour.
         placing: the window in which a photograph is placed.
         notes: the field and buttons of notes.
+        width: of the main panel in the last frame, pixels.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.widgets = Widgets()
         self.minimap, self.placing = Minimap(), PlacingWindow(ctx, self.widgets)
         self.notes = NotesSection(self.widgets)
-        self.path, self.path_file = "", "path.json"
+        self.path, self.path_file, self.width = "", "path.json", 0.0
 
     def draw(self, viewer: Viewer) -> None:
         """Draw the panels that are shown."""
         self.widgets.items.clear()
-        state, stats, placing = viewer.state, viewer.stage.renderer.stats, viewer.placing
+        state, placing = viewer.state, viewer.placing
         if state.overlay:
             self._draw_main_panel(viewer)
-        if stats.total:
+        if viewer.stage.slot.scene is not None:
             draw_legend(state)
         if state.overlay and state.points:
             draw_points(state)
-        if state.overlay and state.hotspots:
+        if state.overlay and state.plan:
             draw_hotspots(viewer.hotspots)
             draw_notes(viewer)
         if state.overlay and placing is not None and placing.node is not None and self.placing.draw(placing):
-            viewer.queue(viewer.scenes.reload)
+            viewer.queue(viewer.session.reload)
         if state.help:
             state.help = _draw_help()
-        if viewer.scenes.loading:
-            self._draw_progress(viewer, *viewer.scenes.loading)
+        if viewer.session.loading:
+            self._draw_progress(viewer, *viewer.session.loading)
         elif viewer.error:
             self._draw_error(viewer, viewer.error)
         if state.message and state.now < state.message_until:
@@ -102,6 +102,7 @@ class Panels:
         imgui.set_next_window_size_constraints((0, size.y), (0.6 * size.x, size.y))
         imgui.set_next_window_bg_alpha(0.98)
         imgui.begin("pansplat", None, _PANEL)
+        self.width = imgui.get_window_width()
         imgui.push_item_width(-110 * scale)
         self._draw_sections(viewer)
         imgui.pop_item_width()
@@ -111,11 +112,11 @@ class Panels:
         """Draw what everybody needs, open, and the rest, closed."""
         section = self.widgets.section
         self._draw_scene(viewer)
-        if viewer.scenes.tour is not None:
-            section("Plan", partial(self._draw_plan, viewer, viewer.scenes.tour))
+        if viewer.session.tour is not None:
+            section("Plan", partial(self._draw_plan, viewer, viewer.session.tour))
         if viewer.state.context.size:
             section("Photographs", partial(self._draw_photographs, viewer))
-        if viewer.scenes.notes or len(viewer.stage.photographs):
+        if viewer.session.notes or len(viewer.stage.photographs):
             section("Notes", partial(self._draw_notes, viewer))
         section("Film", partial(self._draw_film, viewer))
         section("Expert", partial(self._draw_expert, viewer), opened=False)
@@ -123,44 +124,25 @@ class Panels:
     def _draw_photographs(self, viewer: Viewer) -> None:
         """Draw where the camera can go, and the states of estimated poses."""
         state, placing = viewer.state, viewer.placing
-        if state.tour is None:  # whose plan has a list
-            self._draw_panoramas(state, viewer.panoramas)
+        if state.graph is not None:
+            self._draw_list(state, state.graph)
         if self.widgets.button("Stop" if state.playing else "Fly"):
             toggle_play(state)
-        imgui.same_line()
-        imgui.set_next_item_width(-1)
-        flight = self.widgets.slider("##flight", state.flight, 0.0, 1.0, "%.2f of the way")
-        if flight != state.flight:
-            state.playing = False
-            fly_to(state, flight)
         if placing is not None and placing.is_listed:
             opened = any(view.placement.state != "placed" for view in placing.panoramas)
             self.widgets.section("Poses", partial(draw_photographs, viewer, placing, self.widgets), opened=opened)
 
     def _draw_plan(self, viewer: Viewer, tour: TourScenes) -> None:
-        """Draw the floor plan and the list of panoramas, and the progress of the prediction."""
-        state, nodes = viewer.state, range(len(tour.tour))
-        is_known = len(tour.outlines) > 0 or any(map(tour.tour.is_placed, nodes))  # else all are side by side
-        state.minimap = self.widgets.check("floor plan", state.minimap)
-        imgui.same_line()
-        state.hotspots = self.widgets.check("hotspots", state.hotspots)
-        if state.minimap and is_known:
+        """Draw the floor plan, and the progress of the prediction."""
+        state = viewer.state
+        state.plan = self.widgets.check("floor plan and rings", state.plan)
+        if state.plan and (tour.outlines or any(map(tour.tour.is_placed, range(len(tour.tour))))):  # else side by side
             clicked = self.minimap.draw(tour, state.camera)
             state.target = state.target if clicked is None else clicked
             if tour.tour.approximate:
                 imgui.text_disabled("dashed: about here")
-        imgui.set_next_item_width(-1)
-        if imgui.begin_combo("##visit", describe_panoramas(tour.tour) if is_known else "go to a photograph"):
-            for node in nodes:
-                label = describe_panorama(tour.tour, node) if is_known else tour.tour.panoramas[node].label
-                if imgui.selectable(f"{node + 1}. {label}", False)[0]:
-                    state.target = node
-                self.widgets.record(f"visit {node}")
-            imgui.end_combo()
-        else:
-            self.widgets.record("visit")
-        if viewer.scenes.background is not None:
-            task, fraction = viewer.scenes.background
+        if viewer.session.background is not None:
+            task, fraction = viewer.session.background
             draw_wrapped(task)
             imgui.progress_bar(fraction, (-1, 0), f"{100 * fraction:.0f}%")
 
@@ -168,7 +150,7 @@ class Panels:
         """Draw the note at the middle of the image, and what was not used of the folder."""
         if len(viewer.stage.photographs):
             self.notes.draw(viewer)
-        for note in viewer.scenes.notes:
+        for note in viewer.session.notes:
             draw_wrapped(note, is_disabled=True)
 
     def _draw_film(self, viewer: Viewer) -> None:
@@ -177,48 +159,45 @@ class Panels:
         self._draw_path(viewer)
 
     def _draw_expert(self, viewer: Viewer) -> None:
-        """Draw how the camera moves, and what is drawn of the Gaussians."""
-        imgui.separator_text("Camera")
-        self._draw_camera(viewer)
-        if viewer.stage.renderer.stats.total:
-            imgui.separator_text("Gaussians")
-            self._draw_gaussians(viewer.state)
-        imgui.separator_text("Display")
-        self._draw_display(viewer.state)
-        self._draw_settings(viewer)
+        """Draw what is drawn of the Gaussians."""
+        state = viewer.state
+        if viewer.stage.slot.scene is not None:
+            self._draw_gaussians(state)
+        self._draw_display(state)
+        state.stops = self.widgets.check("photographs at panoramas", state.stops)
 
     def _draw_scene(self, viewer: Viewer) -> None:
-        scenes, recent, width = viewer.scenes, viewer.recent, -60 * imgui.get_style().font_scale_dpi
-        if scenes.entries:
-            names = [f"{i + 1}. {name}" for i, name in enumerate(scenes.names)]  # numbered, because names may repeat
+        session, recent, width = viewer.session, viewer.recent, -60 * imgui.get_style().font_scale_dpi
+        if session.entries:
+            names = [f"{i + 1}. {name}" for i, name in enumerate(session.names)]  # numbered, because names may repeat
             imgui.set_next_item_width(-1)
-            changed, index = imgui.combo("##pair", max(scenes.current, 0), names)
+            changed, index = imgui.combo("##pair", max(session.current, 0), names)
             self.widgets.record("pair")
             if changed:
-                viewer.queue(viewer.scenes.choose, index)
+                viewer.queue(session.choose, index)
         imgui.set_next_item_width(width)
         hint, flags = "folder or scene, or drop it here", imgui.InputTextFlags_.enter_returns_true.value
         entered, self.path = imgui.input_text_with_hint("##path", hint, self.path, flags)
         self.widgets.record("path")
         imgui.same_line()
         if (self.widgets.button("Open") or entered) and self.path.strip():
-            viewer.queue(scenes.search, Path(self.path.strip()).expanduser())
+            viewer.queue(session.search, Path(self.path.strip()).expanduser())
         if recent:
             imgui.set_next_item_width(width)
             if imgui.begin_combo("##recent", "recent"):
                 for path in recent:
                     if imgui.selectable(path, False)[0]:
-                        viewer.queue(scenes.search, Path(path))
+                        viewer.queue(session.search, Path(path))
                 imgui.end_combo()
             self.widgets.record("recent")
             imgui.same_line()
-        if scenes.entries and self.widgets.button("Reload"):
-            viewer.queue(viewer.scenes.reload)
-        if viewer.scenes.refinement is not None:
+        if session.entries and self.widgets.button("Reload"):
+            viewer.queue(session.reload)
+        if (fraction := session.refinement) is not None:
             if self.widgets.button("Cancel"):
-                viewer.queue(viewer.scenes.cancel_refinement)
+                viewer.queue(session.cancel_refinement)
             imgui.same_line()
-            imgui.progress_bar(viewer.scenes.refinement, (-1, 0), f"refining {100 * viewer.scenes.refinement:.0f}%")
+            imgui.progress_bar(fraction, (-1, 0), f"refining {100 * fraction:.0f}%")
 
     def _draw_gaussians(self, state: ViewerState) -> None:
         settings, num_views = state.settings, state.num_views
@@ -244,35 +223,17 @@ class Panels:
             settings = replace(settings, levels=None if shown == set(state.levels) else frozenset(shown))
         state.settings = settings
 
-    def _draw_settings(self, viewer: Viewer) -> None:
-        state, settings = viewer.state, viewer.state.settings
-        flags = imgui.ColorEditFlags_.no_inputs.value
-        changed, background = imgui.color_edit3("background", list(settings.background), flags)
-        self.widgets.record("background")
-        if changed:
-            settings = replace(settings, background=(background[0], background[1], background[2]))
-        state.settings = settings
-        state.stops = self.widgets.check("photographs at panoramas", state.stops)
-
-    def _draw_camera(self, viewer: Viewer) -> None:
-        state = viewer.state
-        state.orbiting = self.widgets.check("orbit", state.orbiting)
-        fov = state.camera.vertical_fov_degrees
-        chosen = self.widgets.slider("field of view", fov, cameras.MIN_FOV_DEGREES, cameras.MAX_FOV_DEGREES, "%.0f deg")
-        if chosen != fov:
-            state.camera = replace(state.camera, vertical_fov_degrees=chosen)
-        state.speed = self.widgets.slider("speed", state.speed, 0.1, 10.0, "%.1f m/s")
-
-    def _draw_panoramas(self, state: ViewerState, names: list[str]) -> None:
-        """Draw a button for each panorama, in rows."""
-        style, right = imgui.get_style(), imgui.get_window_pos().x + imgui.get_window_width()
-        for view, name in enumerate(names):
-            width = imgui.calc_text_size(name).x + 2 * style.frame_padding.x + style.item_spacing.x
-            if view and imgui.get_item_rect_max().x + width < right - style.window_padding.x:
-                imgui.same_line()
-            if imgui.button(f"{name}##panorama {view}"):
-                jump_to_view(state, view)
-            self.widgets.record(f"{view + 1}##panorama")
+    def _draw_list(self, state: ViewerState, graph: TourGraph) -> None:
+        """Draw the list of panoramas; a click leads there."""
+        imgui.set_next_item_width(-1)
+        if imgui.begin_combo("##visit", describe_panoramas(graph)):
+            for node in range(len(graph)):
+                if imgui.selectable(f"{node + 1}. {describe_panorama(graph, node)}", False)[0]:
+                    go_to_view(state, node)
+                self.widgets.record(f"visit {node}")
+            imgui.end_combo()
+        else:
+            self.widgets.record("visit")
 
     def _draw_display(self, state: ViewerState) -> None:
         for number, display in enumerate(get_args(Display)):
@@ -292,7 +253,7 @@ class Panels:
         imgui.set_next_window_pos((size.x / 2, size.y - 6 * MARGIN * scale), 0, (0.5, 1.0))
         imgui.set_next_window_size((min(620 * scale, size.x - 2 * MARGIN), 0))
         imgui.begin("##progress", None, FIXED | imgui.WindowFlags_.no_title_bar.value)
-        text = ", ".join(filter(None, (f"{name}: {task}", viewer.scenes.loader.describe_time())))
+        text = ", ".join(filter(None, (f"{name}: {task}", viewer.session.loader.describe_time())))
         at = fraction or -viewer.state.now  # a bar that moves, while nothing is done
         imgui.push_style_color(imgui.Col_.plot_histogram.value, _BAR_COLOR)
         imgui.progress_bar(at, (-80 * scale, 0), "")
@@ -302,7 +263,7 @@ class Panels:
         imgui.get_window_draw_list().add_text(place, white, text)
         imgui.same_line()
         if self.widgets.button("Cancel##loading"):
-            viewer.queue(viewer.scenes.cancel_loading)
+            viewer.queue(viewer.session.cancel_loading)
         imgui.end()
 
     def _draw_screenshot(self, viewer: Viewer) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.tours.route import find_offset
+from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.draw.programs import Programs
-from pansplat_viewer.scene import camera as cameras
 
 
 @dataclass(frozen=True)

@@ -15,21 +15,21 @@ from jaxtyping import Float
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene
 from pansplat.tours.cross_fade import CrossFade
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.loader import LoadedScene
+from pansplat_viewer.core.settings import DrawSettings, RendererChoice
+from pansplat_viewer.core.state import ViewerState, adapt_settings, fit_settings
+from pansplat_viewer.core.stop_fade import StopFade
 from pansplat_viewer.draw.cpu_renderer import create_renderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
+from pansplat_viewer.draw.rendered_scene import RenderedScene, ScenePreparer
 from pansplat_viewer.draw.resolution import AdaptiveResolution, ResolutionPlan
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.loader import LoadedScene
-from pansplat_viewer.scene.settings import DrawSettings, RendererChoice
-from pansplat_viewer.scene.slots import ScenePreparer, SceneSlot
-from pansplat_viewer.scene.state import ViewerState, adapt_settings, fit_settings
-from pansplat_viewer.scene.tour import StopFade
-from pansplat_viewer.ui.photographs import Photographs
+from pansplat_viewer.ui.photograph_textures import PhotographTextures
 from pansplat_viewer.ui.presenter import PhotographLayer, PosedPhotograph, Presenter
 
 DRAW_ERRORS = (InputError, MemoryError, moderngl.Error)
-_EXPOSURE_SECONDS = 1 / 30  # of a frame of a flight, at most, by which its Gaussians blur
-_JUMP = 1.0  # metres between two frames, which no flight flies
+_EXPOSURE_SECONDS = 1 / 30  # longest exposure of a frame of a flight, by which its Gaussians blur
+_JUMP = 1.0  # distance between two frames that only a jump has, metres
 
 
 class Stage:
@@ -60,8 +60,8 @@ class Stage:
         self.fade, self.stop = CrossFade(), StopFade()
         self.preparer = ScenePreparer(self.renderer.prepare)
         self.presenter = Presenter(ctx)
-        self.photographs = Photographs(ctx)
-        self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # of the fade's photographs
+        self.photographs = PhotographTextures(ctx)
+        self._layers = PhotographLayer(self.presenter), PhotographLayer(self.presenter)  # photographs in a fade
         self._stop_layer, self._zoom_layer = PhotographLayer(self.presenter), PhotographLayer(self.presenter)
         self.resolution = self._create_resolution()
         self.size: tuple[int, int] = (1, 1)
@@ -69,15 +69,15 @@ class Stage:
         self.last_camera = state.camera
         self._last_frame, self._shift = state.now, (0.0, 0.0, 0.0)  # its time, and the movement during the exposure
 
-    def _create_slot(self) -> SceneSlot:
-        return SceneSlot(create_renderer(self._ctx, self._choice))
+    def _create_slot(self) -> RenderedScene:
+        return RenderedScene(create_renderer(self._ctx, self._choice))
 
     def _create_resolution(self) -> AdaptiveResolution:
         pacing = self.renderer.pacing
         return AdaptiveResolution(settle_after=pacing.settle_seconds, turn_ms=pacing.turn_ms)
 
     @property
-    def slot(self) -> SceneSlot:
+    def slot(self) -> RenderedScene:
         """The scene that is shown, or that was shown before a photograph."""
         return self.slots[self._scene_slot]
 
@@ -112,7 +112,7 @@ class Stage:
 
     # --- what is shown ---
 
-    def upload(self, slot: SceneSlot, scene: Scene, name: str) -> bool:
+    def upload(self, slot: RenderedScene, scene: Scene, name: str) -> bool:
         """Upload a scene; if this fails, show the error and return False."""
         try:
             slot.upload(scene, self.preparer.take(scene))
@@ -277,7 +277,7 @@ class Stage:
         return scene_slot.image, milliseconds
 
     def _render(
-        self, slot: SceneSlot, cam2world: Float[np.ndarray, "4 4"], settings: DrawSettings, plan: ResolutionPlan
+        self, slot: RenderedScene, cam2world: Float[np.ndarray, "4 4"], settings: DrawSettings, plan: ResolutionPlan
     ) -> float:
         """Draw the image of this plan; returns milliseconds, 0 if it is not new."""
         settings = replace(settings, cached=plan.cached, shift=self._shift)

@@ -9,7 +9,7 @@ import imgui_bundle
 import moderngl
 from imgui_bundle import imgui
 
-_FONT_PIXELS = 16.0
+_FONT_PIXELS = 16.0  # height of the text at a DPI scale of 1
 
 
 class Gui:

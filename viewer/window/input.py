@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pansplat.constants import FAST, WALK_SPEED
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.state import ViewerState, add_key_frame, go_home, jump_to_view, limit_camera, toggle_play
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.state import ViewerState, add_key_frame, go_home, go_to_view, limit_camera, toggle_play
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
 
-SLOW = 0.2  # of the speed, while Alt is held
+SLOW = 0.2  # factor of the speed while Alt is held
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
-ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
+PAN_METRES = 2.0  # movement by a pan over the height of the window
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Input:
     drag: tuple[float, float] = (0.0, 0.0)
     pan: tuple[float, float] = (0.0, 0.0)  # the same with the right or middle button
     scroll: float = 0.0  # wheel steps; positive is scrolling up
-    height: int = 720  # of the window, pixels
+    height: int = 720  # height of the window, pixels
     click: tuple[float, float] | None = None
 
 
@@ -69,17 +69,8 @@ def _toggle(name: str) -> Action:
     return lambda viewer, _: setattr(viewer.state, name, not getattr(viewer.state, name))
 
 
-def _queue(name: str) -> Action:
-    """Call a method of the viewer at the end of the frame."""
-    return lambda viewer, _: viewer.queue(getattr(viewer, name))
-
-
 def _write_screenshot(viewer: Viewer, events: Input) -> None:
     viewer.queue(viewer.write_screenshot, "exr" if "shift" in events.held else "png")
-
-
-def _toggle_plan(state: ViewerState) -> None:
-    state.minimap = state.hotspots = not state.minimap
 
 
 def _restart(state: ViewerState) -> None:
@@ -91,7 +82,7 @@ def _jump_by(state: ViewerState, steps: int) -> None:
     """Go from the nearest panorama to another one, in the order of the list."""
     if len(state.context):
         distances = np.linalg.norm(state.context[:, :3, 3] - state.camera.position, axis=1)
-        jump_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
+        go_to_view(state, (int(distances.argmin()) + steps) % len(state.context))
 
 
 def _escape(viewer: Viewer, _: Input) -> None:
@@ -105,22 +96,18 @@ KEYS = (
     KeyRow("W A S D", "fly forward, left, back, right", dict.fromkeys((*"wasd", "up", "left", "down", "right"))),
     KeyRow("Q E", "fly down, up", dict.fromkeys("qe")),
     KeyRow("Shift, Alt", "faster, slower"),
-    KeyRow("drag", "look around (orbit: turn)"),
+    KeyRow("drag", "look around"),
     KeyRow("click", "distance of a point; twice: the distance between both"),
     KeyRow("right drag", "pan"),
-    KeyRow("scroll", "field of view (orbit: distance)"),
-    KeyRow("V", "orbit or fly", {"v": _toggle("orbiting")}),
-    KeyRow("F", "focus the point in the centre", {"f": _queue("focus_center")}),
-    KeyRow(
-        "1 2 ... 9", "jump to a panorama (tour: fly there)", {str(n + 1): _change(jump_to_view, n) for n in range(9)}
-    ),
+    KeyRow("scroll", "field of view"),
+    KeyRow("1 2 ... 9", "go to a panorama", {str(n + 1): _change(go_to_view, n) for n in range(9)}),
     KeyRow(
         "PgDn, PgUp",
         "the next or previous panorama",
         {"page down": _change(_jump_by, 1), "page up": _change(_jump_by, -1)},
     ),
-    KeyRow("Space", "play the flight between them", {"space": _change(toggle_play)}),
-    KeyRow("M", "floor plan and hotspots of a tour", {"m": _change(_toggle_plan)}),
+    KeyRow("Space", "play the way through them", {"space": _change(toggle_play)}),
+    KeyRow("M", "floor plan and rings of a tour", {"m": _toggle("plan")}),
     KeyRow("K", "key frame of the camera path", {"k": _change(add_key_frame)}),
     KeyRow("P, Shift P", "screenshot PNG, EXR with depth", {"p": _write_screenshot}),
     KeyRow("R", "back to the start", {"r": _change(_restart)}),
@@ -195,26 +182,14 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     )
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
-    if state.orbiting:
-        pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
-        if axes[:2].any():
-            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), events.height)
-        if axes[2]:
-            camera = cameras.dolly(camera, axes[2] * 6 * events.seconds * factor)
-        if any(events.drag):
-            camera = cameras.orbit(camera, events.drag, events.height)
-        if events.scroll:
-            camera = cameras.dolly(camera, events.scroll)
-    else:
-        step = axes * WALK_SPEED * state.speed * factor * events.seconds
-        if axes.any():
-            camera = cameras.fly(camera, *step)
-        if any(events.drag):
-            camera = cameras.turn_by_drag(camera, events.drag, events.height)
-        if events.scroll:
-            camera = cameras.zoom(camera, events.scroll)
+    if axes.any():
+        camera = cameras.fly(camera, *(axes * WALK_SPEED * factor * events.seconds))
+    if any(events.drag):
+        camera = cameras.turn_by_drag(camera, events.drag, events.height)
+    if events.scroll:
+        camera = cameras.zoom(camera, events.scroll)
     if any(events.pan):
-        metres = camera.distance / max(events.height, 1)
+        metres = PAN_METRES / max(events.height, 1)
         camera = cameras.fly(camera, -events.pan[0] * metres, events.pan[1] * metres, 0.0)
     before, state.camera = state.camera, camera
     limit_camera(state, before)

@@ -13,7 +13,7 @@ from pansplat.errors import InputError
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import read_json
 
-_MAX_RECENT = 10
+_MAX_RECENT = 10  # paths that are kept
 
 
 class _File(Struct):

@@ -19,8 +19,8 @@ from pansplat_viewer.draw.offscreen import load_llvm_before_mesa
 from pansplat_viewer.viewer import Viewer
 
 _DEBIAN = "on Debian or Ubuntu: apt-get install libgl1 libegl1 libgl1-mesa-dri libgles2"
-_IDLE_SECONDS = 0.1  # between frames when nothing moves; so that a prediction gets the CPU
-_PENDING_SECONDS = 0.05  # between frames while an image is drawn in the background; so that it gets the CPU
+_IDLE_SECONDS = 0.1  # time between frames when nothing moves; so that a prediction gets the CPU
+_PENDING_SECONDS = 0.05  # time between frames while an image is drawn in the background; so that it gets the CPU
 
 
 class NoWindowError(Exception):
@@ -195,7 +195,7 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         if not moving and time.perf_counter() - before < 0.9 * _IDLE_SECONDS:
             active_until = time.perf_counter() + 0.25  # an event: imgui needs a few frames to process it
         if window.dropped:
-            viewer.scenes.search(window.dropped[-1])
+            viewer.session.search(window.dropped[-1])
             window.dropped.clear()
         now = time.perf_counter()
         seconds, last = now - last, now
@@ -211,6 +211,6 @@ def _run_loop(window: Window, viewer: Viewer) -> None:
         if not shown:
             window.show()
             shown, active_until = True, time.perf_counter() + 0.25
-        scenes = viewer.scenes
-        if scenes.current >= 0 and title != (title := f"{scenes.names[scenes.current]} - pansplat"):
+        session = viewer.session
+        if session.current >= 0 and title != (title := f"{session.names[session.current]} - pansplat"):
             window.set_title(title)

@@ -9,7 +9,7 @@ Source: docs/rendering.md, sections 4 and 7; docs/viewer.md.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -154,7 +154,7 @@ class DisplayScene:
 
         Args:
             position: camera centre.
-            plane: its rotation is from its axes to the world's; a direct panorama has its axes in the world's.
+            plane: its rotation is from its axes to the world's.
             labels: layer of each Gaussian, int16, or `NO_LAYER`.
             num_layers: number of layers.
             near: Gaussians whose mean is nearer are not drawn, metres.
@@ -165,8 +165,6 @@ class DisplayScene:
         statistics, threads, workspace = Statistics(), thread_count(), Workspace()
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
-        if plane.is_panorama:  # its pixels have fixed directions in the records' axes
-            pose[:3, :3], plane = plane.rotation, replace(plane, rotation=torch.eye(3, dtype=torch.float64))
         camera = make_camera(pose, plane, near)
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
         with announce_compilation():

@@ -86,13 +86,6 @@ def test_labels_without_a_layer_are_refused(labels, display, pose):
         draw(display, pose, labels, 2)
 
 
-def test_a_direct_panorama_has_the_axes_of_its_plane(scene, display, pose):
-    plane = ImagePlane((32, 64), pose[:3, :3], 0.0)
-    layers = display.rasterize(pose[:3, 3].numpy(), plane, np.zeros(600, np.int16), 1, NEAR)
-    expected = rasterize(scene, pose, size=(32, 64), backend="numba")
-    assert np.abs(layers.sums[0, :3] - expected.color.numpy()).max() <= 2e-3
-
-
 def test_blended_layers_equal_those_of_the_definition(scene, display, pose):
     sums = draw(display, pose, scene.views.numpy(), 2).sums
     background, weights = (0.2, 0.5, 0.9), torch.tensor((0.7, 0.3))

@@ -11,9 +11,9 @@ from PIL import Image
 
 from pansplat.images.image_files import write_image
 from pansplat.rendering import rasterize
+from pansplat_viewer.core.settings import SCALAR_MAPS, Display, DrawSettings, Mode
 from pansplat_viewer.draw.color_maps import color_by_label, map_values
 from pansplat_viewer.draw.frame_renderer import render_image
-from pansplat_viewer.scene.settings import SCALAR_MAPS, Display, DrawSettings, Mode
 
 pytestmark = pytest.mark.gl
 
@@ -47,14 +47,13 @@ GOLDEN = Path(__file__).parents[2] / "assets" / "viewer.png"  # PANSPLAT_WRITE_G
 
 
 @pytest.mark.parametrize("name", ["cpu", "gl"])
-def test_each_display_mode_and_layout_looks_as_in_the_golden_image(make_renderer, small_scene, pose, name):
+def test_each_display_and_mode_looks_as_in_the_golden_image(make_renderer, small_scene, pose, name):
     renderer, images = make_renderer(small_scene, name), {}
     for display in get_args(Display):
         settings = DrawSettings(display=display, display_max=6.0 if display == "depth" else 1.0)
         images[display] = render_image(renderer, pose, SIZE, settings)[0]
     for mode in get_args(Mode)[1:]:
         images[mode] = render_image(renderer, pose, SIZE, DrawSettings(mode=mode))[0]
-    images["panorama"] = render_image(renderer, pose, (96, 48), DrawSettings(layout="equirect"))[0]
     image = np.concatenate(list(images.values()), axis=1)
     if name == "cpu" and os.environ.get("PANSPLAT_WRITE_GOLDEN"):
         write_image(GOLDEN, image)

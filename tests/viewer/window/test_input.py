@@ -6,16 +6,16 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from pansplat_viewer.scene.state import ViewerState, enter_scene
+from pansplat_viewer.core.state import ViewerState, enter_scene
 from pansplat_viewer.window.input import Input, apply_input
 
 
 def test_a_camera_that_flies_by_hand_stops_along_a_poor_edge(small_scene, house):
-    """The state of a tour is the graph with the poor edges that were found."""
+    """The state has the graph with the poor edges that were found."""
     state = ViewerState()
     enter_scene(state, small_scene)
     (a, b), *_ = house.overlaps
-    state.tour = replace(house, poor=((a, b),))
+    state.graph, state.is_tour = replace(house, poor=((a, b),)), True
     way = house.positions[b] - house.positions[a]
     ahead = np.linalg.inv(np.asarray(state.camera.level)) @ way
     state.camera = replace(

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 from pansplat_viewer import app
-from pansplat_viewer.scene.loader import SceneEntry
+from pansplat_viewer.core.loader import SceneEntry
 from pansplat_viewer.window import window as windows
 from pansplat_viewer.window.window import ContextLostError, Window, _run_loop
 
@@ -21,7 +21,7 @@ def make_window(**values: object) -> Mock:
 
 def make_viewer() -> Mock:
     """A viewer that quits in its first frame."""
-    viewer = Mock(moving=True, pending=None, state=Mock(quit=False), scenes=Mock(current=-1))
+    viewer = Mock(moving=True, pending=None, state=Mock(quit=False), session=Mock(current=-1))
     viewer.frame.side_effect = lambda *_: setattr(viewer.state, "quit", True)
     return viewer
 
@@ -31,7 +31,7 @@ def test_a_dropped_path_is_opened_another_resolution_changes_the_scale_and_waiti
     viewer.moving, viewer.gui.has_input = False, True
     Window._drop(window, None, ["/somewhere/a pair"])
     _run_loop(window, viewer)
-    viewer.scenes.search.assert_called_once_with(Path("/somewhere/a pair"))
+    viewer.session.search.assert_called_once_with(Path("/somewhere/a pair"))
     viewer.gui.set_scale.assert_called_once_with(2.0)
     window.wait.assert_called_once_with(0.0)
     assert window.dropped == [] and window.scale_changed is False
@@ -86,7 +86,7 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
 
     def make(ctx: object, loader: object, **options: object) -> Mock:
         entries, opened = [SceneEntry("a"), SceneEntry("b")], tmp_path / "opened"
-        viewers.append(Mock(scenes=Mock(entries=entries, current=1, path=opened), options=options))
+        viewers.append(Mock(session=Mock(entries=entries, current=1, path=opened), options=options))
         return viewers[-1]
 
     def run(window: object, viewer: Mock) -> None:
@@ -102,4 +102,4 @@ def test_a_new_window_replaces_one_whose_context_is_lost(monkeypatch, tmp_path):
     assert app._run_window(app.Options(tmp_path), (64, 32), None) is None
     first, second = viewers
     assert second.options["state"] is first.options["state"], "camera and settings"
-    second.scenes.show.assert_called_once_with(first.scenes.entries, 1, tmp_path / "opened")
+    second.session.show.assert_called_once_with(first.session.entries, 1, tmp_path / "opened")

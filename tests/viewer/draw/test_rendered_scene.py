@@ -4,13 +4,13 @@ import threading
 
 import pytest
 
-from pansplat_viewer.scene import slots
-from pansplat_viewer.scene.slots import ScenePreparer
+from pansplat_viewer.draw import rendered_scene
+from pansplat_viewer.draw.rendered_scene import ScenePreparer
 
 
 @pytest.fixture(autouse=True)
 def all_scenes_are_large(monkeypatch):
-    monkeypatch.setattr(slots, "_SMALL_SCENE", 0)
+    monkeypatch.setattr(rendered_scene, "_SMALL_SCENE", 0)
 
 
 def test_another_scene_ends_the_conversion_and_errors_are_raised_when_it_is_taken(random_scene, wait_until):

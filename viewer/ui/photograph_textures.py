@@ -16,12 +16,12 @@ from pansplat.inputs.panorama_sets import Note, Panorama
 from pansplat.inputs.photographs import read_notes
 from pansplat.tours.route import STOP_REACH
 
-MAX_HEIGHT = 2048  # pixels; sharper than the image at fields of view above 65 degrees on 720 rows
-_MAX_TEXTURES = 4  # 25 MB each
-_VIEW_HEIGHT = 64  # pixels, of a panorama in which a view is chosen
+MAX_HEIGHT = 2048  # most rows of a texture; sharper than the image at fields of view above 65 degrees on 720 rows
+_MAX_TEXTURES = 4  # textures that are kept, 25 MB each
+_VIEW_HEIGHT = 64  # rows of a panorama in which a view is chosen
 
 
-class Photographs:
+class PhotographTextures:
     """Posed panoramas, and the textures of those that were shown last."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
@@ -32,7 +32,7 @@ class Photographs:
         self._positions: Float[np.ndarray, "photograph 3"] = np.zeros((0, 3))
         self._reading: dict[int, Future[UInt8[np.ndarray, "height width 3"]]] = {}
         self._failed: set[int] = set()
-        self._notes: dict[int, tuple[Note, ...]] = {}  # of panoramas that were shown
+        self._notes: dict[int, tuple[Note, ...]] = {}  # notes of the panoramas that were shown
         self._textures: OrderedDict[int, moderngl.Texture] = OrderedDict()
 
     def __len__(self) -> int:

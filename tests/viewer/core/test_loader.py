@@ -1,7 +1,5 @@
-"""Scenes at a path are found, and loaded in a worker thread."""
+"""Session at a path are found, and loaded in a worker thread."""
 
-import threading
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -20,20 +18,10 @@ from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
 from pansplat.tours.merge import select_views
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
-from pansplat_viewer.scene.settings import DrawSettings
-from pansplat_viewer.scene.state import fit_settings
-from pansplat_viewer.scene.tour import TourScenes
-
-
-def list_loader_threads() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name.startswith("scene-loader")]
-
-
-def work_forever(*_):
-    while True:
-        report_progress("working", 0.5)
-        time.sleep(0.001)
+from pansplat_viewer.core.loader import SceneEntry, find_entries, list_panoramas, load_entry
+from pansplat_viewer.core.settings import DrawSettings
+from pansplat_viewer.core.state import fit_settings
+from pansplat_viewer.core.tour_scenes import TourScenes
 
 
 def test_paths_without_scenes_are_refused(tmp_path):
@@ -187,26 +175,6 @@ def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_a
     assert estimates == [[1]] and len(shown) == 1
     assert [view.name for view in early.tour.panoramas] == [view.name for view in entry.tour.panoramas]
     assert len(set(early.tour.parts)) == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "folder"), [("a/b c", "a_b_c"), ("../x", "x"), ("...", "scene"), ("Küche 1", "Küche_1")]
-)
-def test_folder_name_is_a_single_valid_name(name, folder):
-    assert SceneEntry(name).folder_name == folder
-
-
-def test_a_new_request_cancels_the_previous_one(small_scene, wait_until):
-    def load(entry, show):
-        return work_forever(entry, show) if entry.name == "first" else LoadedScene(entry, small_scene)
-
-    loader = SceneLoader(load)
-    loader.request(SceneEntry("first"))
-    loader.request(SceneEntry("second"))
-    assert wait_until(loader.poll, "result").entry.name == "second"
-    loader.request(SceneEntry("first"))
-    loader.close()
-    assert not list_loader_threads(), "the end cancels the request and joins its thread"
 
 
 def test_a_prediction_has_the_options_and_is_shown_before_the_refined_scene(monkeypatch, small_scene):

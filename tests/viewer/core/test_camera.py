@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.camera import Camera
-from pansplat_viewer.scene.state import ViewerState, enter_scene, jump_to_view, toggle_play
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.camera import Camera
+from pansplat_viewer.core.state import ViewerState, enter_scene, go_to_view, toggle_play
 
 # Right, down, forward of the level camera are x, -z, y: a world with z up.
 Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -60,32 +60,21 @@ def test_fly_moves_along_the_view_and_along_the_up_axis_of_the_scene():
     assert np.allclose(cameras.fly(camera, 0, 1, 0).position, -np.asarray(Z_UP)[:, 1])
 
 
-def test_dolly_approaches_the_centre_and_does_not_pass_it():
-    camera = replace(Camera(), distance=1.0)
-    near = cameras.dolly(camera, 1)
-    assert near.distance == pytest.approx(0.9) and near.position[2] == pytest.approx(0.1)
-    nearest = cameras.dolly(camera, 1000)
-    assert nearest.distance == cameras.MIN_DISTANCE
-    assert np.allclose(nearest.orbit_center, camera.orbit_center)
-
-
 def test_zoom_stays_within_its_bounds():
     assert cameras.zoom(Camera(), 1).vertical_fov_degrees < Camera().vertical_fov_degrees
     assert cameras.zoom(Camera(), 1e3).vertical_fov_degrees == cameras.MIN_FOV_DEGREES
     assert cameras.zoom(Camera(), -1e3).vertical_fov_degrees == cameras.MAX_FOV_DEGREES
 
 
-def test_focus_looks_at_the_point_and_orbits_it():
-    point = np.array((2.0, -1.0, 3.0))
-    camera = cameras.focus_on_point(replace(Camera(), position=(0.5, 0, 0)), point)
-    assert np.allclose(camera.orbit_center, point)
-    assert cameras.focus_on_point(camera, np.asarray(camera.position)) == camera
+def test_the_camera_looks_along_a_direction():
+    direction = np.array((0.48, -0.6, 0.64))
+    assert np.allclose(cameras.look_along(replace(Camera(), level=Z_UP), direction).rotation[:, 2], direction)
 
 
 def test_a_scene_is_entered_in_the_direction_of_its_start_view(small_scene):
     pose = small_scene.cam2world[:1].clone()
     pose[0, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right
-    state, single = ViewerState(), replace(small_scene, cam2world=pose, starts=((0.5, 0.2),))
+    state, single = ViewerState(), replace(small_scene, cam2world=pose, names=("a",), starts=((0.5, 0.2),))
     enter_scene(state, single)
     ahead = np.array((math.cos(0.5) * math.cos(0.2), math.sin(0.2), -math.sin(0.5) * math.cos(0.2)))
     assert np.allclose(state.camera.rotation[:, 2], ahead) and state.home == state.camera
@@ -109,5 +98,5 @@ def test_a_scene_without_cameras_is_seen_from_outside_and_has_no_flight(small_sc
     ahead = (means - np.asarray(state.camera.position)) @ state.camera.rotation[:, 2]
     assert (ahead > 0).mean() > 0.95
     toggle_play(state)
-    jump_to_view(state, 0)
+    go_to_view(state, 0)
     assert not state.playing

@@ -23,8 +23,8 @@ from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece, PlanPose
 from pansplat.poses.solvers import rotation_exp
 from pansplat.tours.graph import find_tours
-from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
-from pansplat_viewer.scene.placing import WALL_ANGLE, Placing, PlanView
+from pansplat_viewer.core.loader import SceneEntry, list_panoramas
+from pansplat_viewer.core.placing_by_hand import WALL_ANGLE, PlacingByHand, PlanView
 
 LIVING_ROOM = Path(__file__).resolve().parents[3] / "assets" / "living_room"
 HALF = np.array((2.6, 1.2, 2.0))  # of a room, metres; cameras are 1.2 m over its floor
@@ -83,12 +83,12 @@ def _load(folder: Path) -> list[Panorama]:
 
 @pytest.fixture
 def placing(folder: Path):
-    placing = Placing(folder, _load(folder), read=_read)
+    placing = PlacingByHand(folder, _load(folder), read=_read)
     yield placing
     placing.close()
 
 
-def _place(placing: Placing, node: int, targets: tuple[int, ...] | None = None) -> None:
+def _place(placing: PlacingByHand, node: int, targets: tuple[int, ...] | None = None) -> None:
     """Start to place a photograph, and wait until all pieces are read."""
     placing.start(node, targets)
     deadline = time.monotonic() + 300
@@ -99,18 +99,18 @@ def _place(placing: Placing, node: int, targets: tuple[int, ...] | None = None) 
 
 
 @pytest.fixture
-def started(placing: Placing) -> Placing:
+def started(placing: PlacingByHand) -> PlacingByHand:
     """Photograph c is placed beside a and b."""
     _place(placing, 2)
     return placing
 
 
-def _move_to(placing: Placing, truth: PlanPose) -> None:
+def _move_to(placing: PlacingByHand, truth: PlanPose) -> None:
     placing.turn(truth.yaw - placing.place.yaw)
     placing.move(truth.right - placing.place.right, truth.forward - placing.place.forward)
 
 
-def _true_place(placing: Placing, name: str = "c") -> PlanPose:
+def _true_place(placing: PlacingByHand, name: str = "c") -> PlanPose:
     return placing.floor.find_place(_pose(name), np.eye(3))
 
 
@@ -120,7 +120,7 @@ def test_a_panorama_is_placed_beside_its_own_group_or_else_that_of_its_approxima
     content = json.loads((folder / "poses.json").read_text())
     content["estimate"]["approximate"][0]["between"] = ["d.png", "c.png"]
     (folder / "poses.json").write_text(json.dumps(content))
-    assert Placing(folder, _load(folder)).list_targets(2) == [(3,), (0, 1)]
+    assert PlacingByHand(folder, _load(folder)).list_targets(2) == [(3,), (0, 1)]
 
 
 @pytest.mark.parametrize("unit", [1.2, None])
@@ -128,7 +128,7 @@ def test_a_panorama_starts_at_its_approximate_place(folder: Path, unit: float | 
     content = json.loads((folder / "poses.json").read_text())
     content["worlds"][0]["unit"] = unit
     (folder / "poses.json").write_text(json.dumps(content))
-    placing = Placing(folder, _load(folder), read=_read)
+    placing = PlacingByHand(folder, _load(folder), read=_read)
     _place(placing, 2)
     (stated,) = content["estimate"]["approximate"]
     expected = _true_place(placing, "a").add(PlanPose(*stated["place"]), unit or 1.5)
@@ -138,7 +138,7 @@ def test_a_panorama_starts_at_its_approximate_place(folder: Path, unit: float | 
 
 def test_a_panorama_to_which_only_a_link_leads_starts_behind_the_door(folder: Path):
     (folder / "links.json").write_text(json.dumps({"b": [{"to": "d", "yaw": -2.0}]}))
-    placing = Placing(folder, _load(folder), read=_read)
+    placing = PlacingByHand(folder, _load(folder), read=_read)
     _place(placing, 3)
     (door,), camera = placing.find_doors(), np.array(placing.find_place(1)[:2])
     ahead = (door - camera) / np.linalg.norm(door - camera)
@@ -148,13 +148,13 @@ def test_a_panorama_to_which_only_a_link_leads_starts_behind_the_door(folder: Pa
     placing.close()
 
 
-def test_a_panorama_of_which_nothing_is_known_starts_beside_the_others_with_parallel_walls(placing: Placing):
+def test_a_panorama_of_which_nothing_is_known_starts_beside_the_others_with_parallel_walls(placing: PlacingByHand):
     _place(placing, 3)
     assert placing.is_aligned
     assert placing.outline(3)[:, 0].min() > placing.outline(0)[:, 0].max() + 0.25
 
 
-def test_walls_snap_to_those_of_the_plan_when_they_are_nearly_parallel(started: Placing):
+def test_walls_snap_to_those_of_the_plan_when_they_are_nearly_parallel(started: PlacingByHand):
     parallel = _true_place(started).yaw + math.pi / 2
     for factor, is_parallel in ((0.9, True), (-0.9, True), (1.1, False)):
         before = started.place
@@ -170,7 +170,7 @@ def test_walls_snap_to_those_of_the_plan_when_they_are_nearly_parallel(started: 
 def test_links_between_the_panorama_and_the_others_meet_the_outlines_at_their_doors(folder: Path):
     links = {"a": [{"to": "c", "yaw": 0.7}], "c": [{"to": "a", "yaw": -1.9}, {"to": "d", "yaw": 0}]}
     (folder / "links.json").write_text(json.dumps(links))
-    placing = Placing(folder, _load(folder), read=_read)
+    placing = PlacingByHand(folder, _load(folder), read=_read)
     _place(placing, 2)
     for door, node, yaw in zip(placing.find_doors(), (0, 2), (0.7, -1.9), strict=True):
         place = placing.find_place(node)
@@ -179,7 +179,9 @@ def test_links_between_the_panorama_and_the_others_meet_the_outlines_at_their_do
     placing.close()
 
 
-def test_a_panorama_placed_at_its_true_pose_is_in_the_tour_after_saving_and_undo_restores(started: Placing, folder):
+def test_a_panorama_placed_at_its_true_pose_is_in_the_tour_after_saving_and_undo_restores(
+    started: PlacingByHand, folder
+):
     before = (folder / "poses.json").read_bytes()
     _move_to(started, _true_place(started))
     assert started.save() and started.node is None and started.error is None
@@ -205,7 +207,7 @@ def test_a_placed_photograph_is_corrected_where_it_is_and_keeps_its_height_and_t
     pose[1, 3], pose[:3, :3] = 0.2, pose[:3, :3] @ rotation_exp(np.array((0.04, 0, 0)))
     content["poses"]["b.png"]["cam2world"] = pose.tolist()
     (folder / "poses.json").write_text(json.dumps(content))
-    placing = Placing(folder, _load(folder), read=_read)
+    placing = PlacingByHand(folder, _load(folder), read=_read)
     _place(placing, 1)
     assert placing.targets == (0,)
     assert np.allclose(placing.find_poses()[1], pose, atol=1e-9)
@@ -218,7 +220,7 @@ def test_a_placed_photograph_is_corrected_where_it_is_and_keeps_its_height_and_t
     placing.close()
 
 
-def test_panoramas_without_poses_are_placed_beside_each_other_and_move_as_a_group(placing: Placing, folder: Path):
+def test_panoramas_without_poses_are_placed_beside_each_other_and_move_as_a_group(placing: PlacingByHand, folder: Path):
     _place(placing, 3, (2,))
     placing.move(0.5, 0.5)
     assert placing.save() and placing.reopen(_list(folder))
@@ -238,7 +240,9 @@ def test_panoramas_without_poses_are_placed_beside_each_other_and_move_as_a_grou
     assert np.allclose(after, before, atol=1e-6)
 
 
-def test_a_folder_that_cannot_be_written_gives_a_message_and_changes_nothing(started: Placing, folder, monkeypatch):
+def test_a_folder_that_cannot_be_written_gives_a_message_and_changes_nothing(
+    started: PlacingByHand, folder, monkeypatch
+):
     before = (folder / "poses.json").read_bytes()
 
     def refuse(*args) -> None:
@@ -259,14 +263,14 @@ def test_photographs_are_placed_in_the_world_of_their_file(folder: Path, unit: f
             row[3] = unit * row[3] + origin
     (folder / "poses.json").write_text(json.dumps(content))
     photographs = _load(folder)
-    assert Placing(folder, photographs).problem is None
+    assert PlacingByHand(folder, photographs).problem is None
     for view, (name, entry) in zip(photographs, content["poses"].items(), strict=False):
         assert view.image.name == name and np.allclose(view.cam2world, entry["cam2world"], rtol=0, atol=1e-8)
 
 
 def test_a_photograph_that_cannot_be_read_is_not_placed(folder: Path):
     _write(folder / "other.png")
-    placing = Placing(folder, _load(folder), read=_read)
+    placing = PlacingByHand(folder, _load(folder), read=_read)
     _place(placing, 4)
     assert placing.node is None and "other.png: no room" in placing.error
     _place(placing, 3)
@@ -276,7 +280,7 @@ def test_a_photograph_that_cannot_be_read_is_not_placed(folder: Path):
 
 def test_poses_of_other_formats_are_listed_as_not_changeable(folder: Path):
     views = [Panorama(name, folder / f"{name}.png", torch.eye(4, dtype=torch.float64)) for name in TRUTH]
-    placing = Placing(folder, views, read=_read)
+    placing = PlacingByHand(folder, views, read=_read)
     assert not placing.is_listed and "got another format" in placing.problem
     placing.start(0)
     assert placing.node is None and placing.error == placing.problem
@@ -285,11 +289,11 @@ def test_poses_of_other_formats_are_listed_as_not_changeable(folder: Path):
 def test_panoramas_can_be_placed_when_their_poses_are_estimated(folder: Path):
     """A window has them before, without poses."""
     entries = _list(folder)
-    before = Placing(folder, [replace(view, placement=Placement("not placed")) for view in _load(folder)])
-    placing = Placing.open(before, entries[0], entries)
+    before = PlacingByHand(folder, [replace(view, placement=Placement("not placed")) for view in _load(folder)])
+    placing = PlacingByHand.open(before, entries[0], entries)
     assert before.problem and placing.problem is None and placing.is_listed
-    assert Placing.open(placing, entries[-1], entries) is placing, "so that its changes can be undone"
-    assert Placing.open(placing, None, []) is None
+    assert PlacingByHand.open(placing, entries[-1], entries) is placing, "so that its changes can be undone"
+    assert PlacingByHand.open(placing, None, []) is None
 
 
 def test_a_view_of_a_plan_has_all_points_and_one_scale():
@@ -310,7 +314,7 @@ def test_real_photographs_are_placed_upright_by_their_estimated_axes(tmp_path: P
     entry = content["poses"].pop("middle.jpg")
     truth = np.array(entry["cam2world"] if isinstance(entry, dict) else entry)
     (folder / "poses.json").write_text(json.dumps(content))
-    placing = Placing(folder, _load(folder))
+    placing = PlacingByHand(folder, _load(folder))
     node = [view.name for view in placing.panoramas].index("middle")
     _place(placing, node)
     _move_to(placing, placing.floor.find_place(truth, placing.pieces[placing.panoramas[node].image].upright))

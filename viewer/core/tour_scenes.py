@@ -1,4 +1,4 @@
-"""The scenes of a tour in a viewer: which one is shown, which are loaded next, which stay in memory, how they fade.
+"""The scenes of a tour in a viewer: which one is shown, which are loaded next, which stay in memory.
 
 Imports no OpenGL: the film and the window use the same objects.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -20,22 +20,42 @@ from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
 from pansplat.tours.limits import EDGE_HYSTERESIS, follow_edge
 from pansplat.tours.links import link_parts
 from pansplat.tours.merge import select_views
-from pansplat.tours.route import REST_SECONDS, STOP_SECONDS, Moment, Route, plan_route
+from pansplat.tours.route import Route, plan_route
 from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_predictions, choose_scene_views
 from pansplat.tours.walks import find_walk, find_way, plan_walk
-from pansplat_viewer.scene.life import SceneLife
-from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
+from pansplat_viewer.core.hotspots import PlaceFacts
+from pansplat_viewer.core.loader import LoadedScene, SceneEntry
 
-_MEMORY = 2 << 30  # bytes of the scenes of a tour that are kept; two predictions are kept in any case
-_LARGEST_STOP_STEP = 1 / 3  # of this fade in a frame, also after a pause without frames
-_NEXT_SCENES = 3  # that are dropped last
+_MEMORY = 2 << 30  # bytes that the scenes of a tour may take; two predictions are kept in any case
+_NEXT_SCENES = 3  # number of the next predictions of a way, which are dropped last
+
+
+@dataclass
+class _Prediction:
+    """A prediction of some panoramas of a tour.
+
+    Attributes:
+        loaded: None before it is predicted, and while it is not in memory.
+        is_known: whether it has been predicted.
+        has_failed: whether it cannot be predicted or refined.
+    """
+
+    loaded: LoadedScene | None = None
+    is_known: bool = False
+    has_failed: bool = False
+
+    def drop(self) -> LoadedScene:
+        """Take the scene out of memory, and return it."""
+        assert self.loaded is not None
+        loaded, self.loaded = self.loaded, None
+        return loaded
 
 
 class TourScenes:
     """The scenes of one tour: chooses, requests and keeps them. It loads nothing itself.
 
     A scene is that of an edge. Its Gaussians are selected from predictions of whole parts
-    (`TourGraph.choose_predictions`); of a network it is a prediction of its own.
+    (`choose_predictions`); of a network it is a prediction of its own.
 
     Attributes:
         tour: the graph.
@@ -51,7 +71,7 @@ class TourScenes:
         Args:
             tour: the graph.
             merged: the scene of all panoramas that the scenes of the edges are parts of; None to predict them.
-            max_views: of the predictor (`TourGraph.choose_predictions`).
+            max_views: of the predictor (`choose_predictions`).
         """
         self.tour = tour
         self._graphs = [tour]  # also those before poor edges and walls were found, which pending entries have
@@ -71,13 +91,13 @@ class TourScenes:
             for views in self._views.values()
         }
         predictions = dict.fromkeys(source for sources in self._sources.values() for source in sources)
-        # Predictions, the least recently used one first.
-        self._lives = OrderedDict((views, SceneLife(SceneEntry("", tour=tour, views=views))) for views in predictions)
+        # The least recently used one is the first.
+        self._predictions = OrderedDict((views, _Prediction()) for views in predictions)
         self._selected: OrderedDict[ViewNumbers, LoadedScene] = OrderedDict()  # from predictions, and the first one
         self._following: tuple[Edge, list[ViewNumbers]] | None = None
         if merged is not None:
             entry = SceneEntry(tour.name, tour=tour, views=everything)
-            self._lives.setdefault(everything, SceneLife(entry)).receive(LoadedScene(entry, merged))
+            self._predictions[everything] = _Prediction(LoadedScene(entry, merged), True)
 
     @staticmethod
     def start(loaded: LoadedScene) -> TourScenes:
@@ -116,7 +136,7 @@ class TourScenes:
 
     def _find(self, views: ViewNumbers) -> LoadedScene | None:
         """A prediction that is in memory."""
-        return self._lives[views].loaded if views in self._lives else None
+        return self._predictions[views].loaded if views in self._predictions else None
 
     def make_entry(self, views: ViewNumbers) -> SceneEntry:
         """The prediction of these panoramas as an entry for the loader."""
@@ -140,11 +160,12 @@ class TourScenes:
                 self._change(replace(self.tour, clearances=self.tour.clearances | clearances))
             if poor := set(facts.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
                 self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
-        if views not in self._lives:
+        if views not in self._predictions:
             self._selected[views] = loaded
             return
-        self._lives[views].receive(loaded)
-        self._lives.move_to_end(views)
+        prediction = self._predictions[views]
+        prediction.loaded, prediction.is_known = loaded, True
+        self._predictions.move_to_end(views)
         for scene in [scene for scene in self._selected if views in self._sources[scene] and self._has_sources(scene)]:
             del self._selected[scene]
         self._drop(views)
@@ -171,7 +192,7 @@ class TourScenes:
 
     def _drop(self, newest: ViewNumbers) -> None:
         """Drop what was not used for the longest time, until the memory is not exceeded."""
-        kept = [views for views, life in self._lives.items() if life.loaded is not None]
+        kept = [views for views, prediction in self._predictions.items() if prediction.loaded is not None]
         every = (*self._selected.values(), *filter(None, map(self._find, kept)))
         total = sum(measure_bytes(each.scene) for each in every)
         needed = {newest, self.views, *self._sources[self.views]}
@@ -181,23 +202,23 @@ class TourScenes:
         may_go = [other for other in kept if other not in needed][: max(len(kept) - 2, 0)]
         for other in may_go:
             if total > _MEMORY:
-                total -= measure_bytes(self._lives[other].drop().scene)
+                total -= measure_bytes(self._predictions[other].drop().scene)
 
     def fail(self, views: ViewNumbers) -> None:
         """Do not request a prediction again, because it could not be loaded or refined."""
-        if views in self._lives:
-            self._lives[views].fail()
+        if views in self._predictions:
+            self._predictions[views].has_failed = True
 
     def get(self, views: ViewNumbers) -> LoadedScene | None:
         """The scene of an edge if it is in memory; it becomes the most recently used."""
-        if views in self._lives:
+        if views in self._predictions:
             loaded = self._find(views)
         elif views not in self._selected and self._has_sources(views):
             loaded = self._selected[views] = self._select(views)
             self._drop(views)
         else:
             loaded = self._selected.get(views)
-        for scenes in (self._selected, self._lives):
+        for scenes in (self._selected, self._predictions):
             for each in (views, *self._sources[views]):
                 if each in scenes:
                     scenes.move_to_end(each)
@@ -265,99 +286,67 @@ class TourScenes:
         Predictions come before refinements. A refinement ends if a prediction that the camera needs is missing; a
         prediction is finished, so that none is lost. One that was dropped from memory is read again when it is needed.
         """
-        lives = {views: self._lives[views] for views in wanted if self._lives[views].state != "failed"}
-        for views in reversed(list(lives)[: 1 + _NEXT_SCENES]):
-            self._lives.move_to_end(views)
-        missing = [views for views, life in lives.items() if life.loaded is None]
-        missing = [views for views in missing if not lives[views].is_known or views in self.missing]
-        if current is not None and (current.views in lives or not missing):
+        predictions = {views: self._predictions[views] for views in wanted if not self._predictions[views].has_failed}
+        for views in reversed(list(predictions)[: 1 + _NEXT_SCENES]):
+            self._predictions.move_to_end(views)
+        missing = [views for views, each in predictions.items() if each.loaded is None]
+        missing = [views for views in missing if not predictions[views].is_known or views in self.missing]
+        if current is not None and (current.views in predictions or not missing):
             is_refined = self._find(current.views) is not None
             if not missing or missing[0] not in self.missing or not is_refined:
                 return None
-        unrefined = (views for views, life in lives.items() if life.loaded is not None and not life.loaded.is_final)
+        unrefined = (views for views, each in predictions.items() if each.loaded and not each.loaded.is_final)
         views = missing[0] if missing else next(unrefined, None)
         if views is None:
             return None
-        if current is not None and current.views in self._lives:
-            self._lives[current.views].cancel()
-        self._lives[views].request()
         return self.make_entry(views)
 
-    def plan_route(self, camera: Float[np.ndarray, "4 4"], remaining: Sequence[int] = ()) -> Route:
-        """A route from a pose through the remaining panoramas; without any, through all of them."""
-        position = camera[:3, 3]
-        if remaining:
-            walk = self._find_way(position, remaining[0])
-            for a, b in itertools.pairwise(remaining):
-                walk += find_walk(self.tour, a, b)[1:]
-        else:
-            edge, _ = self.tour.find_nearest_edge(position, self._find_part(position))
-            distances = np.linalg.norm(self.tour.positions[list(edge)] - position, axis=1)
-            walk = plan_walk(self.tour, edge[int(distances.argmin())])
-        return plan_route(self.tour, walk, camera, rest=REST_SECONDS, outlooks=self.outlooks)
+    def plan_way(self, camera: Float[np.ndarray, "4 4"], nodes: Sequence[int] = (), *, rest: float = 0.0) -> Route:
+        """`plan_way` in the part of a camera, which may be that after a jump; it zooms along edges without a scene."""
+        part, loaded = self.tour.parts[follow_edge(self.tour, camera[:3, 3], self.edge)[0]], set(self.loaded)
+        missing = [edge for edge, views in self._views.items() if views not in loaded]
+        tour = replace(self.tour, poor=tuple({*self.tour.poor, *missing}))
+        return plan_way(tour, camera, nodes, part=part, rest=rest, outlooks=self.outlooks)
 
-    def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
-        """A route from a pose to a panorama."""
-        return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlooks=self.outlooks)
-
-    def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
-        return find_way(self.tour, position, node, self._find_part(position))
-
-    def _find_part(self, position: Float[np.ndarray, "3"]) -> int:
-        """The part of a position, which may be that after a jump."""
-        return self.tour.parts[follow_edge(self.tour, position, self.edge)[0]]
-
-    @property
-    def camera_height(self) -> float:
-        """Height of the cameras over the floor, in the part of the camera if it is known there, metres."""
-        parts = self.tour.parts
-        here = [outline for node, outline in self.outlines.items() if parts[node] == self.part]
+    def find_place(self, position: Float[np.ndarray, "3"]) -> PlaceFacts:
+        """What is known of the nearest panorama; the height is that of cameras in its part, if one is known there."""
+        node, parts = self.find_nearest(position), self.tour.parts
+        here = [outline for other, outline in self.outlines.items() if parts[other] == self.part]
         heights = (outline.camera_height for outline in here or self.outlines.values())
-        return choose_camera_height(heights, self.tour.far)
+        height = choose_camera_height(heights, self.tour.far)
+        return PlaceFacts(node, height, self.hidden.get(node, []), self.outlooks.get(node))
+
+
+def plan_way(
+    graph: TourGraph,
+    camera: Float[np.ndarray, "4 4"],
+    nodes: Sequence[int] = (),
+    *,
+    part: int | None = None,
+    rest: float = 0.0,
+    outlooks: dict[int, np.ndarray] | None = None,
+) -> Route:
+    """A route from a pose through panoramas in their order; without any, through all of them.
+
+    Args:
+        graph: of the panoramas.
+        camera: the pose.
+        nodes: where the route goes.
+        part: of the camera; None if it is unknown.
+        rest, outlooks: see `plan_route`.
+    """
+    position = camera[:3, 3]
+    if nodes:
+        walk = find_way(graph, position, nodes[0], part)
+        for a, b in itertools.pairwise(nodes):
+            walk += find_walk(graph, a, b)[1:]
+    else:
+        edge, _ = graph.find_nearest_edge(position, part)
+        walk = plan_walk(graph, min(edge, key=lambda node: float(np.linalg.norm(graph.positions[node] - position))))
+    return plan_route(graph, walk, camera, rest=rest, outlooks=outlooks)
 
 
 def measure_bytes(scene: Scene) -> int:
     """Bytes of a scene's Gaussians in memory."""
     values = (getattr(scene.gaussians, field.name) for field in fields(scene.gaussians))
     return sum(value.numel() * value.element_size() for value in values)
-
-
-class StopFade:
-    """The photograph of the panorama at which the camera stands; it fades in and out for `STOP_SECONDS`.
-
-    Attributes:
-        index: number of the photograph; None if none is shown.
-        before: of a zoom, the photograph that it begins with; else None.
-        weight: of the photograph over that one or the scene, 0 to 1.
-    """
-
-    def __init__(self) -> None:
-        """No photograph is shown."""
-        self.index: int | None = None
-        self.before: int | None = None
-        self.weight = 0.0
-        self._last = 0.0
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether nothing is seen of the scene."""
-        return self.weight >= 1 or self.before is not None
-
-    def follow(self, moment: Moment, now: float) -> None:
-        """Show what a route shows at time `now` (seconds)."""
-        self._last, self.before, self.index, self.weight = now, None, moment.photograph, moment.weight
-        if moment.arrival is not None:
-            self.before, self.index, self.weight = self.index, moment.step.nodes[1], moment.arrived
-
-    def update(self, index: int | None, now: float, *, at_once: bool = False) -> None:
-        """Go on to time `now`, while the camera stands at a panorama, or at none.
-
-        With `at_once` its photograph is shown already and does not fade in.
-        """
-        step = min(max(now - self._last, 0.0) / STOP_SECONDS, _LARGEST_STOP_STEP)
-        at_once = at_once or self.before is not None  # a zoom has shown it
-        self._last, self.before = now, None
-        if self.weight <= 0 or at_once:
-            self.index = index
-        is_here = index is not None and index == self.index
-        self.weight = 1.0 if is_here and at_once else min(max(self.weight + (step if is_here else -step), 0.0), 1.0)

@@ -1,6 +1,6 @@
 """The scenes of the window: those to choose from, which one is shown, which one comes next, and those of a tour.
 
-`Scenes` follows the loader: each scene has a `SceneLife`. The stage draws them.
+`Session` follows the loader; the stage draws the scenes.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.merge import list_starts
-from pansplat.tours.route import plan_route
-from pansplat.tours.walks import plan_walk
-from pansplat_viewer.scene import camera as cameras
-from pansplat_viewer.scene.life import SceneLife
-from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
-from pansplat_viewer.scene.state import ViewerState, advance_flight, enter_scene, enter_tour, limit_camera
-from pansplat_viewer.scene.tour import TourScenes
-from pansplat_viewer.ui.photographs import find_open_view
+from pansplat.tours.route import REST_SECONDS, Route
+from pansplat_viewer.core import camera as cameras
+from pansplat_viewer.core.hotspots import PlaceFacts
+from pansplat_viewer.core.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
+from pansplat_viewer.core.state import ViewerState, advance_flight, enter_scene, limit_camera
+from pansplat_viewer.core.tour_scenes import TourScenes, plan_way
+from pansplat_viewer.ui.photograph_textures import find_open_view
 from pansplat_viewer.ui.stage import Stage
 
 
-class Scenes:
+class Session:
     """Shows what the loader finds, predicts and refines.
 
     Attributes:
@@ -37,8 +36,7 @@ class Scenes:
         entries: to choose from.
         current: number of the one that is shown or loaded; -1 if there is none.
         path: where they were found; None if they are only loaded again.
-        shown: the scene that is shown, of a tour the first one; None before the first one.
-        coming: the scene that replaces it when it is predicted and prepared; None if there is none.
+        loaded: the scene that is shown, of a tour the first one; None before the first one.
         tour: the scenes of the tour that is shown, or whose photographs are; None for other scenes.
     """
 
@@ -49,7 +47,6 @@ class Scenes:
         loader: SceneLoader,
         find: Find,
         *,
-        at: float,
         show_error: Callable[[str], None],
         listed: Callable[[Path | None], None],
     ) -> None:
@@ -60,20 +57,20 @@ class Scenes:
             stage: draws the image.
             loader: finds and loads entries.
             find: returns the entries of a path; called in a worker thread.
-            at: fraction of the flight at which a scene is entered.
             show_error: shows a message.
             listed: called when other entries are listed, with the path at which they were found.
         """
         self._state, self._stage, self.loader, self._find = state, stage, loader, find
-        self._at = at
         self._show_error, self._listed = show_error, listed
         self.entries: list[SceneEntry] = []
         self.current = -1
         self.path: Path | None = None
         self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
-        self._kept: tuple[list[SceneEntry], int, Path | None] | None = None  # of the scene that is shown
-        self.shown: SceneLife | None = None
-        self.coming: SceneLife | None = None
+        self._kept: tuple[list[SceneEntry], int, Path | None] | None = (
+            None  # what `entries`, `current` and `path` were for the scene that is shown
+        )
+        self.loaded: LoadedScene | None = None
+        self._waiting: LoadedScene | None = None  # it is shown once it is converted for the renderer
         self.tour: TourScenes | None = None
 
     # --- what the panels read ---
@@ -92,17 +89,6 @@ class Scenes:
     def entry(self) -> SceneEntry | None:
         """The entry that is shown or loaded."""
         return self.entries[self.current] if 0 <= self.current < len(self.entries) else None
-
-    @property
-    def loaded(self) -> LoadedScene | None:
-        """The scene that is shown."""
-        return None if self.shown is None else self.shown.loaded
-
-    @property
-    def _waiting(self) -> LoadedScene | None:
-        """The loaded scene of `coming`, which is shown once it is converted for the renderer."""
-        coming = self.coming
-        return coming.loaded if coming is not None and coming.is_known else None
 
     @property
     def is_busy(self) -> bool:
@@ -140,7 +126,7 @@ class Scenes:
     def _loads_for_tour(self) -> bool:
         """Whether the loader works for the tour that is shown, and not for a scene that the user has chosen."""
         entry = self.loader.entry
-        if self.tour is None or self.shown is None:
+        if self.tour is None or self.loaded is None:
             return False
         return self._waiting is None if entry is None else self.tour.is_of(entry)
 
@@ -166,12 +152,9 @@ class Scenes:
         """
         self.entries, self.current, self.path = entries, index, path
         self._listed(path)
-        if self.shown is None:
+        if self.loaded is None:
             self._preview(entries[index])
-        else:
-            self.shown.cancel()
-        self.coming = SceneLife(entries[index])
-        self.coming.request()
+        self._waiting = None
         self.loader.request(entries[index])
 
     def expect(self, entries: list[SceneEntry], path: Path, name: str | None) -> None:
@@ -186,7 +169,7 @@ class Scenes:
         self._show_unplaced(entries)
 
     def _show_unplaced(self, entries: list[SceneEntry]) -> None:
-        if self.shown is None and entries:
+        if self.loaded is None and entries:
             self.entries, self.current, self.path = entries, 0, None
             self._preview(entries[0])
 
@@ -208,14 +191,12 @@ class Scenes:
         if not self.loader.cancel_search():
             self.loader.cancel()
             self._stage.preparer.stop()
-            self.coming, self.current = None, -1
+            self._waiting, self.current = None, -1
             self._restore()
 
     def cancel_refinement(self) -> None:
         """End the refinement of the scene that is shown."""
         self.loader.cancel()
-        if self.shown is not None:
-            self.shown.cancel()
 
     def dismiss(self) -> None:
         """Go on with the scene that is shown after an error."""
@@ -231,9 +212,9 @@ class Scenes:
 
     def poll(self) -> None:
         """Show the scene, the entries or the error of a finished load or search."""
-        loader, coming, waiting = self.loader, self.coming, self._waiting
-        if coming is not None and waiting is not None and self._stage.preparer.is_ready(waiting.scene):
-            self._replace(coming, waiting)
+        loader, waiting = self.loader, self._waiting
+        if waiting is not None and self._stage.preparer.is_ready(waiting.scene):
+            self._replace(waiting)
         requested = loader.entry
         result = loader.poll() if self._waiting is None else None
         if isinstance(result, list) and loader.is_searching:
@@ -248,70 +229,56 @@ class Scenes:
         elif result is not None:
             known = isinstance(result, (InputError, OSError))  # else a defect, or out of memory
             self._show_error(str(result) if known else f"{type(result).__name__}: {result}")
-            if requested is not None and loader.entry is None:  # else the search
-                self._fail(requested)
+            if requested is not None and loader.entry is None and self.tour is not None and self.tour.is_of(requested):
+                self.tour.fail(requested.views)
             self._restore()
 
     def _receive(self, result: LoadedScene) -> None:
         """Take a prediction or a refined scene of the loader."""
-        shown, coming = self.shown, self.coming
-        if shown is not None and self.tour is not None and self.tour.is_of(result.entry):
+        if self.loaded is not None and self.tour is not None and self.tour.is_of(result.entry):
             self.tour.add(result)
-            return
-        if shown is not None and shown.state == "refining" and self.loaded and self.loaded.entry is result.entry:
-            shown.receive(result)
-            return
-        if coming is None or coming.state != "predicting":
-            coming = self.coming = SceneLife(result.entry)
-            coming.request()
-        coming.receive(result)
-        if self._stage.preparer.is_ready(result.scene):
-            self._replace(coming, result)
+        elif self.loaded is not None and self.loaded.entry is result.entry and not self.loaded.is_final:
+            self.loaded = result
+        elif self._stage.preparer.is_ready(result.scene):
+            self._replace(result)
+        else:
+            self._waiting = result
 
-    def _fail(self, requested: SceneEntry) -> None:
-        """Mark an entry as failed, which the loader could not load."""
-        if self.tour is not None and self.tour.is_of(requested):
-            self.tour.fail(requested.views)
-        elif self.coming is not None and self.coming.entry is requested:
-            self.coming.fail()
-        elif self.shown is not None and self.shown.entry is requested:
-            self.shown.cancel()
-
-    def _replace(self, life: SceneLife, loaded: LoadedScene) -> None:
+    def _replace(self, loaded: LoadedScene) -> None:
         """Show a scene; if it does not fit into memory, keep the one before."""
-        self.coming = None
+        self._waiting = None
         if self._stage.upload(self._stage.slots[0], loaded.scene, loaded.entry.name):
             self._stage.has_failed = False
-            self._enter(life, loaded)
-        else:
-            life.fail()
+            self._enter(loaded)
 
     def exchange(self) -> None:
         """Show the refined scene in place of its prediction, while the camera stands still."""
-        stage, life, loaded = self._stage, self.shown, self.loaded
-        if life is None or loaded is None or life.state != "refined" or self._waiting is not None:
+        stage, loaded = self._stage, self.loaded
+        if loaded is None or self.tour is not None or self._waiting is not None or loaded.scene is stage.slot.scene:
             return
-        if loaded.scene is stage.slot.scene or not stage.preparer.is_ready(loaded.scene):
-            return
-        if not stage.upload(stage.slot, loaded.scene, loaded.entry.name):
-            life.fail()
+        if stage.preparer.is_ready(loaded.scene) and not stage.upload(stage.slot, loaded.scene, loaded.entry.name):
+            self.loaded = replace(loaded, scene=stage.slot.scene)  # the prediction stays
 
-    def _enter(self, life: SceneLife, loaded: LoadedScene) -> None:
+    def _enter(self, loaded: LoadedScene) -> None:
         """Show a scene that is uploaded, and go to its start."""
         stage, state, entry = self._stage, self._state, loaded.entry
-        photograph = stage.photograph if self.shown is None else None
-        remaining = self._list_remaining() if self.shown is None else ()
-        self.shown, self.tour = life, None
+        photograph = stage.photograph if self.loaded is None else None
+        remaining = self._list_remaining() if self.loaded is None else ()
+        self.loaded, self.tour = loaded, None
         self._kept = self.entries, self.current, self.path
         stage.clear()
         stage.photographs.open(entry.panoramas)
         state.show_message(f"{entry.name}   (H shows the keys)")
+        enter_scene(state, loaded.scene, entry.tour, entry.start)
         if entry.tour is None:
-            enter_scene(state, loaded.scene, at=self._at)
-            state.bounds = None if loaded.facts is None else loaded.facts.bounds
+            state.graph = state.graph if loaded.facts is None else loaded.facts.bounds
             limit_camera(state, state.home)
         else:
-            self._enter_tour(loaded, remaining)
+            stage.add_slot()
+            self.tour = TourScenes.start(loaded)
+            self.tour.move(np.asarray(state.camera.position))
+        if remaining:  # a way over the photographs goes on
+            state.route, state.playing = self._plan_way(remaining, REST_SECONDS), True
         tour, part = self.tour, 0 if self.tour is None else self.tour.part
         stage.scene_views = entry.views
         is_here = tour is None or tour.is_inside(np.asarray(state.camera.position), entry.views)
@@ -326,19 +293,16 @@ class Scenes:
         photographs, view = self._stage.photographs, self._find_view()
         photographs.open(entry.panoramas)
         self._stage.clear()
-        self.tour = None
         source = entry.tour or entry.pair
         if source is None:
+            self.tour = None
             return
         panoramas = entry.panoramas if entry.pair is None else entry.pair.context
         poses = torch.stack([panorama.cam2world for panorama in panoramas])
         starts, frame = list_starts(panoramas), panoramas[0].frame
         scene = Scene(empty_gaussians(), poses, source.near, source.far, starts=starts, frame=frame)
-        if entry.tour is None:
-            enter_scene(self._state, scene, at=self._at)
-        else:
-            enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, plan_walk(entry.tour)), at=self._at)
-            self.tour = TourScenes(entry.tour)
+        enter_scene(self._state, scene, entry.tour)
+        self.tour = None if entry.tour is None else TourScenes(entry.tour)
         self._keep_view(view, entry.panoramas)
         nearest = photographs.find_nearest(np.asarray(self._state.camera.position))
         if nearest is not None:
@@ -360,8 +324,7 @@ class Scenes:
             if view is not None and each.image == view[0]:
                 camera, pose = self._state.camera, each.cam2world.double().numpy()
                 moved = replace(camera, position=tuple(pose[:3, 3].tolist()))
-                turned = cameras.focus_on_point(moved, pose[:3, 3] + pose[:3, :3] @ view[1])
-                self._state.camera = replace(turned, distance=camera.distance)
+                self._state.camera = cameras.look_along(moved, pose[:3, :3] @ view[1])
 
     def _face_open_view(self, entry: SceneEntry, index: int) -> None:
         """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""
@@ -372,23 +335,12 @@ class Scenes:
                 forward = find_direction(panorama.cam2world, find_open_view(panorama), 0.0).numpy()
             except InputError:  # it is shown when the photograph is
                 return
-            self._state.camera = self._state.home = cameras.focus_on_point(camera, camera.position + forward)
+            self._state.camera = self._state.home = cameras.look_along(camera, forward)
 
     # --- tours ---
 
-    def _enter_tour(self, loaded: LoadedScene, remaining: tuple[int, ...]) -> None:
-        """Enter a tour; a flight over its photographs goes on through the remaining panoramas."""
-        tour, state = loaded.entry.tour, self._state
-        assert tour is not None
-        self._stage.add_slot()
-        self.tour = TourScenes.start(loaded)
-        enter_tour(state, tour, loaded.scene, plan_route(tour, plan_walk(tour, loaded.entry.start)), at=self._at)
-        self.tour.move(np.asarray(state.camera.position))
-        if remaining:
-            state.route, state.playing = self.tour.plan_route(state.camera.cam2world, remaining), True
-
     def _list_remaining(self) -> tuple[int, ...]:
-        """The panoramas that a flight through a tour still visits; none if there is no flight."""
+        """The panoramas that a route still visits; none if the camera follows none."""
         route, state = self._state.route, self._state
         return route.list_remaining(state.flight) if route is not None and state.playing else ()
 
@@ -399,7 +351,7 @@ class Scenes:
             return
         route = state.route if state.playing else None
         tour.move(np.asarray(state.camera.position), None if state.moment is None else state.moment.step.edge)
-        state.tour = tour.tour  # poor edges and walls are found later
+        state.graph = tour.tour  # poor edges and walls are found later
         self._show_place(tour)
         self._stage.fade.move(state.camera.cam2world, tour.part)
         if self._loads_for_tour:
@@ -419,28 +371,45 @@ class Scenes:
         if loaded is not None and stage.fade_to_scene(loaded, tour.part, can_wait=self._waiting is None):
             return
         shows_scene = stage.photograph is None and stage.fade.parts[stage.fade.front] == tour.part
-        if self.shown is None or not (shows_scene and tour.is_inside(position, stage.scene_views)):
+        if self.loaded is None or not (shows_scene and tour.is_inside(position, stage.scene_views)):
             for end in tour.edge:  # that of the other end is read before it is needed
                 stage.get_photograph(end)
             stage.fade_to_photograph(tour.find_nearest(position), tour.part)
 
     def fly(self, seconds: float, was_playing: bool) -> None:
-        """Advance the flight; in a tour from wherever the camera is."""
-        state, tour = self._state, self.tour
-        if tour is not None and state.route is not None:
-            pose = state.camera.cam2world
-            if state.target is not None:
-                state.route, state.flight, state.playing = tour.plan_way(pose, state.target), 0.0, True
-            elif state.playing and not was_playing:
-                if state.flight == 0:
-                    state.route = tour.plan_route(pose)
-                elif not np.allclose(pose, state.route.pose(state.flight), atol=1e-4):
-                    state.route = tour.plan_route(pose, state.route.list_remaining(state.flight))
-                    state.flight = 0.0
-            state.target = None
-            if state.playing:  # photographs are read before they are shown
-                for node in state.route.list_remaining(state.flight)[:2]:
-                    self._stage.get_photograph(node)
-                if state.moment is not None and state.moment.arrival is not None and self._stage.photographs.is_reading:
-                    return
-        advance_flight(state, seconds)
+        """Follow the route, from wherever the camera is."""
+        state, route = self._state, self._state.route
+        if route is None:
+            return
+        if state.target is not None:
+            state.route, state.flight, state.playing = self._plan_way((state.target,)), 0.0, True
+        elif state.playing and not was_playing:
+            if state.flight == 0:
+                state.route = self._plan_way((), REST_SECONDS)
+            elif not np.allclose(state.camera.cam2world, route.pose(state.flight), atol=1e-4):
+                state.route, state.flight = self._plan_way(route.list_remaining(state.flight), REST_SECONDS), 0.0
+        state.target = None
+        for node in self._list_remaining()[:2]:  # photographs are read before they are shown
+            self._stage.get_photograph(node)
+        if not (state.is_zooming and self._stage.photographs.is_reading):
+            advance_flight(state, seconds)
+
+    def find_place(self) -> PlaceFacts | None:
+        """What is known of the panorama that is nearest to the camera; None without any."""
+        state, facts = self._state, None if self.loaded is None else self.loaded.facts
+        position = np.asarray(state.camera.position)
+        if self.tour is not None:
+            return self.tour.find_place(position)
+        if state.graph is None or facts is None:
+            return None
+        node = int(np.linalg.norm(state.graph.positions - position, axis=1).argmin())
+        return PlaceFacts(node, facts.usual_heights[node], facts.hidden[node])
+
+    def _plan_way(self, nodes: Sequence[int], rest: float = 0.0) -> Route:
+        """A route from the camera through panoramas; see `plan_way`."""
+        graph, pose = self._state.graph, self._state.camera.cam2world
+        if self.tour is not None:
+            return self.tour.plan_way(pose, nodes, rest=rest)
+        assert graph is not None
+        graph = graph if self.loaded is not None else replace(graph, poor=tuple(graph.overlaps))  # only photographs
+        return plan_way(graph, pose, nodes, rest=rest)

@@ -9,57 +9,51 @@ from jaxtyping import Float
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import (
-    find_direction,
-    fly_pose,
     level_axes,
-    level_pose,
-    up_direction,
 )
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.limits import limit_step
-from pansplat.tours.route import NEAR_OF_FAR, Moment, Route
-from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
-from pansplat_viewer.scene.picking import PickedPoint
-from pansplat_viewer.scene.settings import Display, DrawSettings
+from pansplat.tours.merge import make_graph
+from pansplat.tours.route import NEAR_OF_FAR, Moment, Route, plan_route
+from pansplat.tours.walks import plan_walk
+from pansplat_viewer.core.camera import Camera, move_to_pose
+from pansplat_viewer.core.picking import PickedPoint
+from pansplat_viewer.core.settings import Display, DrawSettings
 
-FLIGHT_SECONDS = 6.0
-KEY_SECONDS = 2.0  # between key frames that are added one after the other
-_MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
+KEY_SECONDS = 2.0  # time between key frames that are added one after the other
+_MAX_SAMPLES = 100_000  # most Gaussians that a percentile is measured on
 
 
 @dataclass
 class ViewerState:
     """Everything that a user can change, and the scene's cameras and levels.
 
-    The camera moves in two ways without input: along the flight between panoramas (`flight`, in a tour along
-    `route`), and along the path of key frames (`path`).
+    The camera moves in two ways without input: along the way between panoramas (`route`), and along the path of key
+    frames (`path`).
 
     Attributes:
         overlay, help: whether panels and key help are shown.
         context: poses of the input cameras; empty for a file without cameras. Of a tour, of all panoramas.
-        minimap, hotspots: whether the floor plan of a tour and the places of its panoramas are shown.
+        plan: whether the floor plan of a tour, the rings of its panoramas and notes are shown.
     """
 
     camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
     home: Camera = field(default_factory=Camera)
-    orbiting: bool = False  # whether the camera orbits (True) or flies (False)
     settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
-    flight: float = 0.0  # fraction of the flight between the panoramas, in [0, 1]
-    playing: bool = False  # whether this flight goes on
+    flight: float = 0.0  # fraction of `route`, in [0, 1]
+    playing: bool = False  # whether the camera follows it
     overlay: bool = True
     help: bool = False
     stops: bool = True  # whether the photograph is shown where the camera stands at a panorama
-    speed: float = 1.0  # of flying, metres per second
     context: Float[np.ndarray, "view 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     num_views: int = 0  # number of input cameras of the scene that is shown
-    tour: TourGraph | None = None  # that is shown; None for other scenes
-    route: Route | None = None  # the flight through a tour; None if none is planned, and in other scenes
-    target: int | None = None  # the panorama of a tour to fly to; None if there is none
-    bounds: TourGraph | None = None  # whose surfaces stop the camera in a scene that is no tour
+    graph: TourGraph | None = None  # the input cameras, whose surfaces stop the camera; None without any
+    is_tour: bool = False  # whether that is the graph of a tour
+    route: Route | None = None  # the way through the panoramas; None without cameras
+    target: int | None = None  # the panorama to go to; None if there is none
     has_stopped: bool = False  # whether they have, and a message has said so
-    minimap: bool = True
-    hotspots: bool = True
+    plan: bool = True
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
     path_seconds: float = 0.0  # time on the path that the panel shows
     path_playing: bool = False  # whether the camera moves along the path
@@ -73,8 +67,14 @@ class ViewerState:
 
     @property
     def moment(self) -> Moment | None:
-        """Of the route through a tour, while the camera follows it."""
+        """Of the route, while the camera follows it."""
         return self.route.at(self.flight) if self.route is not None and self.playing else None
+
+    @property
+    def is_zooming(self) -> bool:
+        """Whether the camera is in a zoom of the route."""
+        moment = self.moment
+        return moment is not None and moment.arrival is not None
 
     @property
     def draw_settings(self) -> DrawSettings:
@@ -86,48 +86,40 @@ class ViewerState:
         self.message, self.message_until = message, self.now + 4
 
 
-def enter_scene(state: ViewerState, scene: Scene, *, at: float = 0.0) -> None:
-    """Start in a scene at a fraction of its flight; settings that the scene does not support are reset.
+def enter_scene(state: ViewerState, scene: Scene, tour: TourGraph | None = None, start: int | None = None) -> None:
+    """Start in a scene; settings that it does not support are reset.
 
     In a scene of the same cameras as the one before, the camera stays where it is.
+
+    Args:
+        state: is changed.
+        scene: that is shown, of a tour the first one.
+        tour: None for another scene, in which cameras may fly between any two panoramas.
+        start: the panorama of the tour at which the way through it starts; None to choose one.
     """
-    before = state.camera if _are_same(state.context, scene.cam2world.numpy()) else None
+    graph = tour or (make_graph(scene).with_all_edges() if len(scene.cam2world) else None)
+    context = np.zeros((0, 4, 4)) if graph is None else graph.cam2world.numpy()
+    before = state.camera if _are_same(state.context, context) else None
     adapt_settings(state, scene, keep_levels=False)
-    state.settings = replace(state.settings, near=NEAR)
-    state.context = scene.cam2world.double().numpy()
-    state.tour = state.route = state.target = state.bounds = None
-    state.playing, state.flight, state.points = False, min(max(at, 0.0), 1.0), []
-    level = _level_camera(state.camera, level_axes(scene.cam2world))
-    camera = move_to_pose(level, _choose_start_pose(scene, state.flight))
-    if state.flight == 0 and scene.starts and scene.starts[0] is not None:
-        forward = find_direction(scene.cam2world[0], *scene.starts[0]).numpy()
-        camera = focus_on_point(camera, np.asarray(camera.position) + forward)
-    state.camera = state.home = replace(camera, distance=_measure_distance(scene, 50))
-    if before is not None:
-        state.camera = replace(before, distance=state.home.distance)
-    state.depth_max = _measure_distance(scene, 98)
+    state.settings = replace(state.settings, near=NEAR if tour is None else NEAR_OF_FAR * tour.far)
+    state.graph, state.is_tour, state.context, state.target, state.route = graph, tour is not None, context, None, None
+    state.playing, state.flight, state.points = False, 0.0, []
+    if graph is None:
+        level, pose = level_axes(scene.cam2world), _choose_outside_pose(scene)
+    else:
+        walk = range(len(graph)) if tour is None else plan_walk(graph, start)
+        state.route, level = plan_route(graph, walk), graph.level_axes
+        pose = state.route.pose(0.0)
+    levelled = replace(state.camera, level=tuple(tuple(row) for row in level.tolist()))
+    state.home = move_to_pose(levelled, pose)
+    state.camera = before or state.home
+    state.depth_max = _measure_depth(scene)
     choose_display(state, state.settings.display)
-
-
-def enter_tour(state: ViewerState, tour: TourGraph, scene: Scene, route: Route, *, at: float = 0.0) -> None:
-    """Start in a tour, whose first scene is `scene`, at a fraction of a route through it; see `enter_scene`."""
-    before = state.camera if _are_same(state.context, tour.cam2world.numpy()) else None
-    enter_scene(state, scene)
-    state.settings = replace(state.settings, near=NEAR_OF_FAR * tour.far)
-    state.tour, state.context = tour, tour.cam2world.numpy()
-    state.route, state.flight = route, min(max(at, 0.0), 1.0)
-    level = _level_camera(state.camera, tour.level_axes)
-    state.camera = state.home = move_to_pose(level, route.pose(state.flight))
-    state.camera = before or state.camera
 
 
 def _are_same(first: Float[np.ndarray, "a 4 4"], second: Float[np.ndarray, "b 4 4"]) -> bool:
     """Whether poses of input cameras are the same, up to the rounding of a file."""
     return len(first) == len(second) > 0 and np.allclose(first, second, atol=1e-5)
-
-
-def _level_camera(camera: Camera, axes: Float[np.ndarray, "3 3"]) -> Camera:
-    return replace(camera, level=tuple(tuple(float(x) for x in row) for row in axes))
 
 
 def adapt_settings(state: ViewerState, scene: Scene, *, keep_levels: bool = True) -> None:
@@ -157,34 +149,23 @@ def limit_camera(state: ViewerState, before: Camera) -> None:
 
     At a panorama of a tour that no edge leads to, it stays where it is.
     """
-    bounds, camera = state.tour or state.bounds, state.camera
-    if bounds is None or state.orbiting or camera.position == before.position:
+    graph, camera = state.graph, state.camera
+    if graph is None or camera.position == before.position:
         return
     place = np.array(before.position)
-    first, last = bounds.find_nearest_edge(place)[0]
-    if first != last or state.tour is None:
-        place = limit_step(bounds, place, np.array(camera.position))
+    first, last = graph.find_nearest_edge(place)[0]
+    if first != last or not state.is_tour:
+        place = limit_step(graph, place, np.array(camera.position))
     state.camera = replace(camera, position=tuple(place.tolist()))
-    if state.tour is None and not state.has_stopped and not np.allclose(place, camera.position):
+    if not state.is_tour and not state.has_stopped and not np.allclose(place, camera.position):
         state.has_stopped = True
-        state.show_message("Surfaces stop the camera: no photograph shows what is behind them   (V: orbit around them)")
+        state.show_message("Surfaces stop the camera: no photograph shows what is behind them")
 
 
-def jump_to_view(state: ViewerState, view: int) -> None:
-    """Move to an input camera's position and heading, level; does nothing if the scene has no such camera.
-
-    In a tour, the camera flies there, along the graph.
-    """
-    if view >= len(state.context):
-        return
-    if state.route is not None:
+def go_to_view(state: ViewerState, view: int) -> None:
+    """Go to an input camera; does nothing if the scene has no such camera."""
+    if view < len(state.context):
         state.target = view
-        return
-    up = up_direction(torch.from_numpy(state.context))
-    target = level_pose(torch.from_numpy(state.context[view]), up).numpy()
-    state.playing = False
-    state.camera = move_to_pose(state.camera, target)
-    state.flight = view / max(len(state.context) - 1, 1)
 
 
 def go_home(state: ViewerState) -> None:
@@ -192,19 +173,9 @@ def go_home(state: ViewerState) -> None:
     state.playing, state.camera = False, state.home
 
 
-def fly_to(state: ViewerState, fraction: float) -> None:
-    """Move the camera to a fraction of the flight."""
-    state.flight = min(max(fraction, 0.0), 1.0)
-    if state.route is not None:
-        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
-    elif len(state.context):
-        target = fly_pose(torch.from_numpy(state.context), state.flight).numpy()
-        state.camera = move_to_pose(state.camera, target)
-
-
 def toggle_play(state: ViewerState) -> None:
     """Start or stop the flight; at its end, start it from the beginning."""
-    if not len(state.context):
+    if state.route is None:
         return
     state.playing = not state.playing
     if state.playing and state.flight >= 1:
@@ -213,9 +184,9 @@ def toggle_play(state: ViewerState) -> None:
 
 def advance_flight(state: ViewerState, seconds: float) -> None:
     """Move along the flight if it is playing, and stop at its end."""
-    if state.playing:
-        duration = FLIGHT_SECONDS if state.route is None else state.route.seconds
-        fly_to(state, state.flight + seconds / duration)
+    if state.playing and state.route is not None:
+        state.flight = min(state.flight + seconds / state.route.seconds, 1.0)
+        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
         state.playing = state.flight < 1
 
 
@@ -238,7 +209,7 @@ def show_path(state: ViewerState, seconds: float) -> None:
     """Move the camera to a time of the path."""
     state.playing, state.path_seconds = False, max(seconds, 0.0)
     if len(state.path):
-        pose, fov = state.path.interpolate(state.path_seconds, np.asarray(state.camera.level), state.tour)
+        pose, fov = state.path.interpolate(state.path_seconds, np.asarray(state.camera.level), state.graph)
         state.camera = replace(move_to_pose(state.camera, pose), vertical_fov_degrees=fov)
 
 
@@ -249,10 +220,8 @@ def advance_path(state: ViewerState, seconds: float) -> None:
         state.path_playing = state.path_seconds < state.path.seconds
 
 
-def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"]:
-    """Return the pose at a fraction of the flight; in a scene without cameras, a pose that sees it from outside."""
-    if len(scene.cam2world):
-        return fly_pose(scene.cam2world, fraction).numpy()
+def _choose_outside_pose(scene: Scene) -> Float[np.ndarray, "4 4"]:
+    """A pose that sees a scene without cameras from outside."""
     matrix = np.eye(4)
     matrix[:3, :3] = level_axes(scene.cam2world)
     means = _sample_means(scene)
@@ -262,14 +231,14 @@ def _choose_start_pose(scene: Scene, fraction: float) -> Float[np.ndarray, "4 4"
     return matrix
 
 
-def _measure_distance(scene: Scene, percent: float) -> float:
-    """Return a percentile of the distances from the first camera (else the start pose), metres; 2 if none."""
+def _measure_depth(scene: Scene) -> float:
+    """The distance from the first camera (else of the start pose) within which 98 % of the Gaussians are, metres."""
     means = _sample_means(scene)
     if not len(means):
         return 2.0
     if len(scene.cam2world):
-        return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), percent)
-    return 2 * _measure_percentile(means, np.median(means, axis=0), percent)
+        return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), 98)
+    return 2 * _measure_percentile(means, np.median(means, axis=0), 98)
 
 
 def _sample_means(scene: Scene) -> Float[np.ndarray, "m 3"]:

@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.gaussians.scene import Scene
+from pansplat_viewer.core.background import BackgroundWorker
+from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
-from pansplat_viewer.scene.background import BackgroundWorker
-from pansplat_viewer.scene.settings import DrawSettings
 
 _SMALL_SCENE = 100_000  # Gaussians; converted without a thread, because that takes less time than a frame
 _LARGE_SCENE = 2_000_000  # Gaussians; the first image is not waited for, because it can take seconds
 
 
-class SceneSlot:
+class RenderedScene:
     """A renderer, the scene that it draws, and its last image, which is drawn again only if something changed.
 
     Attributes:

@@ -12,7 +12,7 @@ from pansplat.system.progress import show_progress
 
 Result = TypeVar("Result")
 Report = Callable[..., None]  # description of the work, fraction done
-_LEAST_SECONDS, _LEAST_FRACTION = 2.0, 0.05  # of work, before which its remaining time is unknown
+_LEAST_SECONDS, _LEAST_FRACTION = 2.0, 0.05  # duration and share of work before its remaining time is estimated
 
 
 class CancelledError(Exception):

@@ -1,4 +1,4 @@
-"""The interactive camera (yaw, pitch, orbit), and the pinhole cameras of images and cube faces.
+"""The interactive camera (yaw, pitch), and the pinhole cameras of images and cube faces.
 
 Pure functions without window or GL.
 
@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.constants import MAX_FOV_DEGREES, MAX_PITCH_DEGREES, MIN_FOV_DEGREES
+from pansplat.constants import FILTER_VARIANCE, MAX_FOV_DEGREES, MAX_PITCH_DEGREES, MIN_FOV_DEGREES
 from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.path import turn_axes
 
 MAX_PITCH_RADIANS = math.radians(MAX_PITCH_DEGREES)
-MIN_DISTANCE = 0.05  # metres, from the orbit centre
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,6 @@ class Camera:
     pitch_radians: float = 0.0  # angle above the horizon
     vertical_fov_degrees: float = 75.0  # vertical field of view
     level: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    distance: float = 2.0  # from the camera to the orbit centre ahead, metres
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
@@ -48,10 +46,9 @@ class Camera:
         matrix[:3, 3] = self.position
         return matrix
 
-    @property
-    def orbit_center(self) -> Float[np.ndarray, "3"]:
-        """The orbit centre, metres."""
-        return np.asarray(self.position) + self.distance * self.rotation[:, 2]
+    def find_focal(self, height: int) -> float:
+        """The focal length of an image with this height, pixels."""
+        return 0.5 * height / math.tan(math.radians(self.vertical_fov_degrees) / 2)
 
 
 def move_to_pose(camera: Camera, cam2world: Float[np.ndarray, "4 4"]) -> Camera:
@@ -76,7 +73,7 @@ def turn(camera: Camera, yaw_radians: float, pitch_radians: float) -> Camera:
 
 def turn_by_drag(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
     """Turn so that the scene follows a pointer that moved by `pixels` (right, down); `height` is the window's."""
-    radians_per_pixel = 2 * math.tan(math.radians(camera.vertical_fov_degrees) / 2) / max(height, 1)
+    radians_per_pixel = 1 / camera.find_focal(max(height, 1))
     return turn(camera, -pixels[0] * radians_per_pixel, pixels[1] * radians_per_pixel)
 
 
@@ -87,36 +84,17 @@ def fly(camera: Camera, right: float, up: float, forward: float) -> Camera:
     return replace(camera, position=_triple(np.asarray(camera.position) + step))
 
 
-def orbit(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
-    """Turn around the orbit centre; a drag over the window's height is half a turn."""
-    radians_per_pixel = math.pi / max(height, 1)
-    center = camera.orbit_center
-    turned = turn(camera, pixels[0] * radians_per_pixel, -pixels[1] * radians_per_pixel)
-    return replace(turned, position=_triple(center - camera.distance * turned.rotation[:, 2]))
-
-
-def dolly(camera: Camera, steps: float) -> Camera:
-    """Move towards (positive) or away from the orbit centre by 10% of the distance per step."""
-    center = camera.orbit_center
-    distance = max(camera.distance * 0.9**steps, MIN_DISTANCE)
-    return replace(camera, distance=distance, position=_triple(center - distance * camera.rotation[:, 2]))
-
-
 def zoom(camera: Camera, steps: float) -> Camera:
     """Narrow (positive) or widen the field of view by 8% per step."""
     fov = min(max(camera.vertical_fov_degrees * 0.92**steps, MIN_FOV_DEGREES), MAX_FOV_DEGREES)
     return replace(camera, vertical_fov_degrees=fov)
 
 
-def focus_on_point(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
-    """Look at a point and make it the orbit centre; a point at the camera's position changes nothing."""
-    offset = np.asarray(camera.level).T @ (np.asarray(point) - np.asarray(camera.position))
-    distance = float(np.linalg.norm(offset))
-    if distance < 1e-6:
-        return camera
-    yaw = math.atan2(offset[0], offset[2])
-    pitch = _clamp(math.asin(_clamp(-offset[1] / distance, 1.0)), MAX_PITCH_RADIANS)
-    return replace(camera, yaw_radians=yaw, pitch_radians=pitch, distance=max(distance, MIN_DISTANCE))
+def look_along(camera: Camera, direction: Float[np.ndarray, "3"]) -> Camera:
+    """Turn the camera to a unit direction."""
+    right, down, forward = np.asarray(camera.level).T @ direction
+    pitch = _clamp(math.asin(_clamp(-float(down), 1.0)), MAX_PITCH_RADIANS)
+    return replace(camera, yaw_radians=math.atan2(right, forward), pitch_radians=pitch)
 
 
 def _clamp(value: float, limit: float) -> float:
@@ -146,6 +124,11 @@ class Pinhole:
         """Half the image size in image-plane units (z = 1)."""
         return 0.5 * self.width / self.focal, 0.5 * self.height / self.focal
 
+    @property
+    def filter_deviation(self) -> float:
+        """Standard deviation of the low-pass filter (docs/rendering.md, section 2), in image-plane units."""
+        return math.sqrt(FILTER_VARIANCE) / self.focal
+
     def compute_side_normals(self) -> Float[np.ndarray, "4 3"]:
         """Return the inward unit normals, in world axes, of the view frustum's four sides."""
         x, y = self.half_size
@@ -154,13 +137,11 @@ class Pinhole:
         return normals @ self.rotation.T
 
 
-def create_face_cameras(
-    orientation: Float[np.ndarray, "3 3"], position: tuple[float, float, float], face_size: int, border: int
-) -> list[Pinhole]:
-    """Return the six face cameras of a cube with axes `orientation` (to world), with `border` extra pixels a side."""
+def create_face_cameras(position: tuple[float, float, float], face_size: int, border: int) -> list[Pinhole]:
+    """Return the six face cameras of a cube along the world's axes, with `border` extra pixels a side."""
     side = face_size + 2 * border
     rotations = face_rotations().numpy()
-    return [Pinhole(orientation @ face, position, 0.5 * face_size, side, side) for face in rotations]
+    return [Pinhole(face, position, 0.5 * face_size, side, side) for face in rotations]
 
 
 def find_faces_in_view(camera_to_faces: Float[np.ndarray, "3 3"], half_size: tuple[float, float]) -> list[int]:

@@ -19,20 +19,20 @@ from pansplat.geometry.path import wrap_angle
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import Piece, PlanFrame, PlanPose, find_wall_yaw, read_piece
-from pansplat_viewer.scene.background import BackgroundWorker, Report
-from pansplat_viewer.scene.loader import SceneEntry, list_panoramas
+from pansplat_viewer.core.background import BackgroundWorker, Report
+from pansplat_viewer.core.loader import SceneEntry, list_panoramas
 
 if TYPE_CHECKING:
     from pansplat_viewer.window.input import Input
 
-WALL_ANGLE = math.radians(6)  # within which walls become parallel
-_APART = 0.3  # metres, between a door or the others and a panorama of which no place is known
-_PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # metres, around what a plan shows, and of its sides
+WALL_ANGLE = math.radians(6)  # walls within this angle become parallel
+_APART = 0.3  # distance of a panorama without a known place from a door or the others, metres
+_PLAN_MARGIN, _LEAST_EXTENT = 0.6, 4.0  # margin around what a plan shows, and its least side, metres
 
 Nodes = tuple[int, ...]
 
 
-class Placing:
+class PlacingByHand:
     """The panoramas of a folder, and the one that is being placed.
 
     Attributes:
@@ -68,14 +68,16 @@ class Placing:
         self.node: int | None = None
         self.targets: Nodes = ()
         self._anchor = 0  # the one of `targets` that the first place is relative to
-        self._world: int | None = None  # of `targets`; None if they have no pose
+        self._world: int | None = None  # number of the world of `targets`; None if they have no pose
         self.floor = PlanFrame(np.eye(3), 1.0)
         self.place: PlanPose | None = None
         self._is_changed = False  # whether the poses of `panoramas` are older than the file
         self.error: str | None = None
 
     @staticmethod
-    def open(before: Placing | None, entry: SceneEntry | None, entries: Sequence[SceneEntry]) -> Placing | None:
+    def open(
+        before: PlacingByHand | None, entry: SceneEntry | None, entries: Sequence[SceneEntry]
+    ) -> PlacingByHand | None:
         """The panoramas of the folder of an entry, those of `before` if they are the same; None without any.
 
         Args:
@@ -89,7 +91,7 @@ class Placing:
                 return before
             before.close()
         panoramas = [] if source is None else list_panoramas(entries, source.folder)
-        return Placing(source.folder, panoramas) if source is not None and panoramas else None
+        return PlacingByHand(source.folder, panoramas) if source is not None and panoramas else None
 
     def reopen(self, entries: Sequence[SceneEntry]) -> bool:
         """Take the poses of panoramas that were loaded again; returns False if they are others, or had no poses before.
@@ -396,26 +398,30 @@ class PlanView:
         middle: of the rectangle, metres (right, forward).
         pixels_per_metre: scale.
         size: of the rectangle, pixels.
+        corner: of the rectangle on the screen, pixels.
     """
 
     middle: tuple[float, float]
     pixels_per_metre: float
     size: tuple[float, float]
+    corner: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
-    def of_points(points: Float[np.ndarray, "n 2"], size: tuple[float, float]) -> PlanView:
+    def of_points(
+        points: Float[np.ndarray, "n 2"], size: tuple[float, float], corner: tuple[float, float] = (0.0, 0.0)
+    ) -> PlanView:
         """The view of points with a margin, at least 4 m wide."""
         low, high = points.min(axis=0), points.max(axis=0)
         extent = np.maximum(high - low + 2 * _PLAN_MARGIN, _LEAST_EXTENT)
         right, forward = ((low + high) / 2).tolist()
-        return PlanView((right, forward), float(np.min(np.array(size) / extent)), size)
+        return PlanView((right, forward), float(np.min(np.array(size) / extent)), size, corner)
 
     def to_pixels(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels (right, down) from the rectangle's corner."""
+        """Pixels (right, down) of places on the screen."""
         scale = self.pixels_per_metre
-        return (np.asarray(places) - self.middle) * (scale, -scale) + np.array(self.size) / 2
+        return (np.asarray(places) - self.middle) * (scale, -scale) + np.array(self.size) / 2 + self.corner
 
     def contains(self, points: Float[np.ndarray, "n 2"]) -> bool:
         """Whether points are inside."""
-        pixels = self.to_pixels(points)
+        pixels = self.to_pixels(points) - self.corner
         return bool(((pixels >= 0) & (pixels <= self.size)).all())

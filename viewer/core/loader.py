@@ -16,7 +16,7 @@ from pansplat.errors import InputError, InputWarning, NothingFoundError, collect
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.files import is_scene_file, make_portable_name
 from pansplat.system.progress import CONNECTED, report_progress, stage
-from pansplat_viewer.scene.background import BackgroundWorker
+from pansplat_viewer.core.background import BackgroundWorker
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
@@ -29,7 +29,7 @@ ShowEntries = Callable[[list["SceneEntry"]], None]
 Find = Callable[[Path, ShowEntries], list["SceneEntry"]]
 
 
-_WAIT = 0.01  # seconds between looks at a search
+_WAIT = 0.01  # time between two looks at a search, seconds
 
 
 def make_file_name(name: str) -> str:
@@ -51,10 +51,10 @@ class SceneEntry:
     pair: "PanoramaSet | None" = None
     file: Path | None = None  # the scene file, or None
     tour: "TourGraph | None" = None  # the tour, or None
-    views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
+    views: tuple[int, ...] = ()  # numbers in the tour of the panoramas of one of its scenes
     start: int | None = None
     max_views: int = 1
-    merged: "Scene | None" = None  # of a tour from a file: the scene in it, of all panoramas
+    merged: "Scene | None" = None  # the scene of all panoramas, if the tour is from a file
     notes: tuple[str, ...] = ()  # what was not used or not placed at its path, and why
 
     @property
@@ -198,7 +198,7 @@ def _with_facts(entry: SceneEntry, scene: "Scene", is_final: bool = True) -> Loa
     from pansplat.tours.facts import TourFacts
 
     facts = TourFacts(scene) if len(scene.cam2world) else None
-    _ = facts and facts.bounds  # computed in this thread
+    _ = facts and (facts.bounds, facts.usual_heights, facts.hidden)  # computed in this thread
     return LoadedScene(entry, scene, is_final, facts)
 
 
@@ -263,18 +263,6 @@ def _choose_first_scene(tour: "TourGraph", walked: "TourGraph") -> tuple[int, tu
     return first, scenes.get(edge) or scenes[tour.find_edge(first)]
 
 
-@dataclass
-class _Request:
-    """An entry that is loaded."""
-
-    entry: SceneEntry
-    preview: LoadedScene | None = None  # its prediction, which is being refined
-    is_shown: bool = False  # whether `poll` has returned the prediction
-
-    def show(self, preview: LoadedScene) -> None:
-        self.preview = preview
-
-
 class SceneLoader:
     """Finds, loads and refines entries in worker threads; a new request cancels the previous one of its kind."""
 
@@ -283,7 +271,9 @@ class SceneLoader:
         self._load = load
         self._loading: BackgroundWorker[LoadedScene] = BackgroundWorker("scene-loader")
         self._searching: BackgroundWorker[list[SceneEntry]] = BackgroundWorker("scene-loader-search")
-        self._request: _Request | None = None
+        self._entry: SceneEntry | None = None  # what is loaded
+        self._previews: list[LoadedScene] = []  # at most its prediction, which is being refined
+        self._is_shown = False  # whether `poll` has returned the prediction
         self._searched = ""
         self._early: list[list[SceneEntry]] = []  # at most one list, of the search that goes on
 
@@ -306,8 +296,9 @@ class SceneLoader:
 
     def request(self, entry: SceneEntry) -> None:
         """Start loading an entry."""
-        request = self._request = _Request(entry)
-        self._loading.start(lambda _: self._load(entry, request.show))
+        previews = self._previews = []
+        self._entry, self._is_shown = entry, False
+        self._loading.start(lambda _: self._load(entry, previews.append))
 
     @property
     def is_searching(self) -> bool:
@@ -317,16 +308,16 @@ class SceneLoader:
     @property
     def entry(self) -> SceneEntry | None:
         """The entry that is being loaded or refined; None if the loader is idle."""
-        return self._request.entry if self._request else None
+        return self._entry
 
     @property
     def progress(self) -> tuple[str, str, float] | None:
         """Name of the entry or path, task and fraction done; None if nothing is loading."""
         if self._searching.progress is not None:
             return self._searched, *self._searching.progress
-        if self._request is None or self._request.is_shown or self._loading.progress is None:
+        if self._entry is None or self._is_shown or self._loading.progress is None:
             return None
-        return self._request.entry.name, *self._loading.progress
+        return self._entry.name, *self._loading.progress
 
     def describe_time(self) -> str:
         """The remaining time of what `progress` is of, or the time that it has taken."""
@@ -337,7 +328,7 @@ class SceneLoader:
         """Fraction of the refinement that is done; None if no scene is being refined."""
         progress = self._loading.progress
         # A refinement is the second half of `pipeline.predict`.
-        return max(2 * progress[1] - 1, 0.0) if progress and self._request and self._request.is_shown else None
+        return max(2 * progress[1] - 1, 0.0) if progress and self._is_shown else None
 
     def poll(self) -> LoadedScene | list[SceneEntry] | BaseException | None:
         """Return a prediction that is being refined, then the result or exception of the request, each once.
@@ -348,20 +339,20 @@ class SceneLoader:
         if self._early and self._searching.future is not None and not self._searching.future.done():
             return self._early.pop()
         found = self._searching.poll()
-        if found is not None or self._request is None:
+        if found is not None or self._entry is None:
             return found
-        if self._request.preview is not None and not self._request.is_shown:
-            self._request.is_shown = True
-            return self._request.preview
+        if self._previews:
+            self._is_shown = True
+            return self._previews.pop()
         loaded = self._loading.poll()
         if loaded is not None:
-            self._request = None
+            self._entry, self._is_shown = None, False
         return loaded
 
     def cancel(self) -> None:
         """Cancel the request; its thread stops at its next progress call."""
         self._loading.cancel()
-        self._request = None
+        self._entry, self._is_shown = None, False
 
     def cancel_search(self) -> bool:
         """Stop to look for entries; returns whether there was a search."""

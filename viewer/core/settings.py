@@ -5,21 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from pansplat.constants import NEAR
-from pansplat.errors import InputError
 
 Mode = Literal["joint", "view", "deferred"]
-Layout = Literal["pinhole", "equirect"]
 RendererChoice = Literal["auto", "gl", "cpu"]
 Display = Literal["color", "depth", "opacity", "levels", "views"]
 
-_CHOICES = {
-    "mode": Mode,
-    "layout": Layout,
-    "display": Display,
-}
+_BLUR_STEPS = 20  # steps a metre; movements are rounded up to them, so that a selection serves several frames
 SCALAR_MAPS: dict[Display, str] = {"depth": "turbo", "opacity": "viridis"}
 """Displays of one number a pixel, and their colour maps."""
 
@@ -34,7 +28,7 @@ class DrawSettings:
         display: `color`; `depth`, the mean radial distance, metres; `opacity` of the pixel; `levels` and
             `views`, a colour for each label.
         display_max: of `depth` and `opacity`, the number with the last colour of the map; the first is 0.
-        cached: draw a pinhole image from six cube faces that are kept for this position, so that a rotation of the
+        cached: draw the image from six cube faces that are kept for this position, so that a rotation of the
             camera costs one texture look-up a pixel. Missing faces in the field of view are drawn first. Where that
             would need faces of more than 2048 pixels (a narrow field of view), the image is drawn directly.
         shift: movement of the camera while the picture is exposed, metres, world axes: Gaussians blur along it.
@@ -49,33 +43,20 @@ class DrawSettings:
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
     near: float = NEAR  # Gaussians whose mean is nearer than this radial distance, metres, are not drawn
-    vertical_fov_degrees: float = 90.0  # of layout `pinhole`, in (0, 180)
-    layout: Layout = "pinhole"  # `pinhole`, or `equirect`, which OpenGL stitches from six cube faces
+    vertical_fov_degrees: float = 90.0  # in (0, 180)
     cached: bool = False
     scale: float = 1.0
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in get_args(choices):
-                raise InputError(f"`{name}` must be one of {', '.join(get_args(choices))}, got {value!r}")
-        if not 0 < self.vertical_fov_degrees < 180:
-            raise InputError(
-                f"`vertical_fov_degrees` must be between 0 and 180, got {self.vertical_fov_degrees}; "
-                "use layout equirect for a whole panorama"
-            )
-        if not 0 < self.display_max < math.inf:
-            raise InputError(f"`display_max` must be a positive number, got {self.display_max}")
-        if not 0 < self.near < math.inf:
-            raise InputError(f"`near` must be a positive distance in metres, got {self.near}")
-        if not 0 < self.scale <= 1:
-            raise InputError(f"`scale` must be in (0, 1], got {self.scale}")
 
     @property
     def shows_scene(self) -> bool:
         """Whether the colours of the whole scene are shown."""
         return self.levels is None and self.display == "color" and self.mode != "view"
+
+    @property
+    def largest_blur(self) -> float:
+        """Standard deviation, radians, by which the movement blurs the nearest Gaussians at most."""
+        return math.ceil(_BLUR_STEPS * math.hypot(*self.shift)) / _BLUR_STEPS / (math.sqrt(12) * self.near)
 
     @property
     def splat_colors(self) -> Literal["color", "levels", "views"]:
@@ -85,11 +66,9 @@ class DrawSettings:
 
 @dataclass(frozen=True)
 class FrameStats:
-    """Counts and times of the last frame.
+    """Times of the last frame.
 
     Attributes:
-        drawn: splats sent to the GPU for this frame after culling, summed over faces and views; 0 if all layers
-            were cached.
         sort_ms: time of the last sort and of the colours that depend on the position, possibly in the background.
         settled: False if the frame used the order and colours of an earlier position because the new ones are not
             ready, or the last image because the new one is not ready; render again to get it.
@@ -99,12 +78,8 @@ class FrameStats:
         stages: milliseconds of each stage, where the renderer measures them.
     """
 
-    total: int = 0  # Gaussians of the scene on the GPU
-    drawn: int = 0
     sort_ms: float = 0.0
     frame_ms: float = 0.0
     timed: DrawSettings | None = None
-    cached: bool = False  # whether the frame used cached layers only
     settled: bool = True
     stages: Mapping[str, float] = field(default_factory=dict)
-    size: tuple[int, int] = (0, 0)  # (width, height) at which the image was drawn, pixels

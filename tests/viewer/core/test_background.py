@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from pansplat_viewer.scene.background import BackgroundWorker
+from pansplat_viewer.core.background import BackgroundWorker
 
 
 def test_cancelled_work_ends_before_the_next_begins_and_work_that_waits_is_never_begun():
@@ -34,7 +34,7 @@ def test_work_states_the_time_that_it_took_then_about_how_long_it_still_takes(mo
     worker: BackgroundWorker[None] = BackgroundWorker("worker")
     assert worker.describe_time() == ""
     now, reported, released = [0.0], threading.Event(), threading.Event()
-    monkeypatch.setattr("pansplat_viewer.scene.background.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("pansplat_viewer.core.background.time.monotonic", lambda: now[0])
 
     def work(report):
         report("working", 0.25)

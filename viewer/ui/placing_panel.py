@@ -1,6 +1,6 @@
 """The list of panoramas with the states of their poses, and the window in which one is placed by hand.
 
-All that they change is in `pansplat_viewer.scene.placing`.
+All that they change is in `pansplat_viewer.core.placing_by_hand`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from jaxtyping import Float
 
 from pansplat.inputs.placements import Placement
 from pansplat.poses.placing import Piece
-from pansplat_viewer.scene.placing import Placing, PlanPose, PlanView
+from pansplat_viewer.core.placing_by_hand import PlacingByHand, PlanPose, PlanView
+from pansplat_viewer.ui.minimap import Color, draw_floors
 from pansplat_viewer.ui.widgets import Widgets, draw_wrapped
 
 if TYPE_CHECKING:
     from pansplat_viewer.viewer import Viewer
-
-Color = tuple[float, float, float, float]
 
 STATES: dict[str, Color] = {
     "sure": (0.45, 0.8, 0.5, 1.0),
@@ -32,10 +31,10 @@ _WALL, _FLOOR, _BACK = (0.9, 0.9, 0.92, 1.0), (0.3, 0.33, 0.37, 1.0), (0.1, 0.11
 _PIECE, _PIECE_FLOOR, _ALIGNED = (0.35, 0.8, 1.0, 1.0), (0.35, 0.8, 1.0, 0.22), (0.5, 1.0, 0.55, 1.0)
 _DOOR = (1.0, 0.6, 0.2, 1.0)
 _KNOB, _REACH = 34.0, 9.0  # pixels from the camera to the knob, and around the knob, at a DPI scale of 1
-_WHEEL = math.radians(1)  # of a step of the wheel
+_WHEEL = math.radians(1)  # angle that a step of the wheel turns a panorama by
 _BUTTONS = 150.0  # pixels from the list's left border to the buttons, at a DPI scale of 1
-_ROWS = 0.25, 0.7  # of the photograph that are shown
-_SIZE = 520.0  # of the window, pixels at a DPI scale of 1
+_ROWS = 0.25, 0.7  # the first and last row of the photograph that is shown, fractions of its height
+_SIZE = 520.0  # width of the window, pixels at a DPI scale of 1
 _FLAGS = imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_scroll_with_mouse.value
 
 
@@ -46,7 +45,7 @@ def describe_state(placement: Placement) -> str:
     return "nowhere" if placement.about is None else "about here"
 
 
-def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None:
+def draw_photographs(viewer: Viewer, placing: PlacingByHand, widgets: Widgets) -> None:
     """Draw the list of panoramas with the states of their poses, and the buttons that change them."""
     column = _BUTTONS * imgui.get_style().font_scale_dpi
     for node, panorama in enumerate(placing.panoramas):
@@ -63,14 +62,14 @@ def draw_photographs(viewer: Viewer, placing: Placing, widgets: Widgets) -> None
     if placing.problem is not None:
         draw_wrapped(placing.problem, is_disabled=True)
     if placing.can_undo and widgets.button("Undo##poses") and placing.undo():
-        viewer.queue(viewer.scenes.reload)
+        viewer.queue(viewer.session.reload)
 
 
 class PlacingWindow:
     """Draws the window of the panorama that is being placed.
 
     Attributes:
-        corner, view: of the plan in the last frame, pixels; for tests that drag.
+        view: of the plan in the last frame.
     """
 
     def __init__(self, ctx: moderngl.Context, widgets: Widgets) -> None:
@@ -78,7 +77,6 @@ class PlacingWindow:
         self._ctx, self._widgets = ctx, widgets
         self._texture: moderngl.Texture | None = None
         self._shown: Piece | None = None  # in the texture
-        self.corner = (0.0, 0.0)
         self.view = PlanView((0.0, 0.0), 1.0, (1.0, 1.0))
         self._fitted: tuple[object, ...] = ()  # what the view was fitted to
         self._held: str | None = None  # what the pointer drags
@@ -89,7 +87,7 @@ class PlacingWindow:
             self._texture.release()
         self._texture = self._shown = None
 
-    def draw(self, placing: Placing) -> bool:
+    def draw(self, placing: PlacingByHand) -> bool:
         """Draw the window; returns whether poses were changed, so that the scenes are to be loaded again."""
         assert placing.node is not None
         scale, display = imgui.get_style().font_scale_dpi, imgui.get_io().display_size
@@ -113,7 +111,7 @@ class PlacingWindow:
             placing.stop()
         return is_changed
 
-    def _draw_choice(self, placing: Placing, node: int) -> None:
+    def _draw_choice(self, placing: PlacingByHand, node: int) -> None:
         """Draw what is placed, and beside which group if there are several."""
         names, options = [panorama.label for panorama in placing.panoramas], placing.list_targets(node)
         imgui.align_text_to_frame_padding()
@@ -147,11 +145,10 @@ class PlacingWindow:
         middle = at.x + width / 2
         imgui.get_window_draw_list().add_line((middle, at.y), (middle, at.y + height), _color(_PIECE), 1.0)
 
-    def _draw_plan(self, placing: Placing, scale: float) -> None:
+    def _draw_plan(self, placing: PlacingByHand, scale: float) -> None:
         """Draw the plan, and apply the pointer and the wheel to the panorama."""
         available, at = imgui.get_content_region_avail(), imgui.get_cursor_screen_pos()
         size = (max(available.x, 50.0), max(available.y - 56 * scale, 50.0))
-        self.corner = (at.x, at.y)
         imgui.invisible_button("plan", size)
         self._widgets.record("plan")
         self._handle(placing, scale)
@@ -161,25 +158,24 @@ class PlacingWindow:
         shown = {node: outline for node, outline in outlines.items() if outline is not None}
         if not shown:
             return
-        points, key = np.concatenate(list(shown.values())), (placing.node, tuple(shown), size)
+        corner, points = (at.x, at.y), np.concatenate(list(shown.values()))
+        key = placing.node, tuple(shown), size, corner
         if key != self._fitted or (self._held is None and not self.view.contains(points)):
-            self._fitted, self.view = key, PlanView.of_points(points, size)
+            self._fitted, self.view = key, PlanView.of_points(points, size, corner)
         canvas, end = imgui.get_window_draw_list(), (at.x + size[0], at.y + size[1])
-        canvas.push_clip_rect(self.corner, end, True)
-        canvas.add_rect_filled(self.corner, end, _color(_BACK))
+        canvas.push_clip_rect(corner, end, True)
+        canvas.add_rect_filled(corner, end, _color(_BACK))
         shapes = {node: self._to_screen(outline) for node, outline in shown.items()}
         others = [node for node in shown if node in placing.targets]
-        for node in others:
-            _draw_line(canvas, shapes[node], _WALL, 3 * scale)
-        for node in others:  # over the lines: an outline that ends in another one's floor draws no wall
-            canvas.add_concave_poly_filled(shapes[node], _color(_FLOOR))
+        draw_floors([shown[node] for node in others], self.view, (_WALL, _FLOOR), scale)
         for node in others:
             place, panorama = placing.find_place(node), placing.panoramas[node]
             x, y = self._draw_camera(canvas, place, STATES[describe_state(panorama.placement)], scale)
             canvas.add_text((x + 7 * scale, y - 8 * scale), _color(_WALL), panorama.label)
         for node in [node for node in shown if node not in others]:
             canvas.add_concave_poly_filled(shapes[node], _color(_PIECE_FLOOR))
-            _draw_line(canvas, shapes[node], _ALIGNED if placing.is_aligned else _PIECE, 2 * scale)
+            color, closed = _color(_ALIGNED if placing.is_aligned else _PIECE), imgui.ImDrawFlags_.closed.value
+            canvas.add_polyline(shapes[node], color, thickness=2 * scale, flags=closed)
         if placing.place is not None:
             half, center = 4 * scale, self._draw_camera(canvas, placing.place, _PIECE, scale)
             canvas.add_circle(center, _KNOB * scale, _color((*_PIECE[:3], 0.35)), 0, scale)
@@ -189,7 +185,7 @@ class PlacingWindow:
         canvas.pop_clip_rect()
 
     def _to_screen(self, places: Float[np.ndarray, "n 2"]) -> list[tuple[float, float]]:
-        return [(x + self.corner[0], y + self.corner[1]) for x, y in self.view.to_pixels(places).tolist()]
+        return [(x, y) for x, y in self.view.to_pixels(places).tolist()]
 
     def _draw_camera(
         self, canvas: imgui.ImDrawList, place: PlanPose, color: Color, scale: float
@@ -206,7 +202,7 @@ class PlacingWindow:
         ((x, y),) = self._to_screen(np.array([place[:2]]))
         return x + _KNOB * scale * math.sin(place.yaw), y - _KNOB * scale * math.cos(place.yaw)
 
-    def _handle(self, placing: Placing, scale: float) -> None:
+    def _handle(self, placing: PlacingByHand, scale: float) -> None:
         io, mouse = imgui.get_io(), imgui.get_mouse_pos()
         if placing.place is None or not imgui.is_item_active():
             self._held = None
@@ -222,11 +218,6 @@ class PlacingWindow:
             placing.turn_to(math.atan2(mouse.x - x, y - mouse.y))
         if imgui.is_item_hovered() and io.mouse_wheel:
             placing.turn(io.mouse_wheel * _WHEEL)
-
-
-def _draw_line(canvas: imgui.ImDrawList, points: list[tuple[float, float]], color: Color, width: float) -> None:
-    """Draw a closed line; the order of the arguments differs among imgui's versions."""
-    canvas.add_polyline(points, _color(color), flags=imgui.ImDrawFlags_.closed.value, thickness=width)
 
 
 def _color(color: Color) -> int:

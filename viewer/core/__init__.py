@@ -1,0 +1,1 @@
+"""What needs neither window nor OpenGL: scenes, tours, cameras, state and settings."""

@@ -1,1 +1,0 @@
-"""What is shown: scenes, tours, cameras and settings."""
