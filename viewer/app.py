@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from pansplat.tours.camera_path import CameraPath
 
-_WRITTEN = "[0-9]*_*.png", "film.mp4"  # the files of --offscreen
+_WRITTEN = "[0-9]*_*.png", "film.mp4"  # offscreen
 _WINDOW_SIZE, _FILM_SIZE = (1280, 720), (1920, 1080)  # pixels
 _SETTINGS = DrawSettings(mode="deferred")
 _PREDICTION_PART = 0.6  # share of the prediction in the progress of a film; the rest is drawing

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pansplat.errors import InputError
 from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
@@ -18,13 +17,26 @@ from pansplat.tours.graph import TourGraph
 from pansplat.tours.merge import make_graph
 from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
 from pansplat.tours.walks import plan_walk
+from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.loader import LoadedScene, SceneEntry, make_file_name
 from pansplat_viewer.core.settings import DrawSettings
-from pansplat_viewer.core.state import fit_settings
+from pansplat_viewer.core.state import ViewerState, enter_scene, fit_settings
 from pansplat_viewer.core.tour_scenes import TourScenes
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 
 FIELD_OF_VIEW = 75.0  # vertical field of view of films, degrees
+_ORBIT_SECONDS, _ORBIT_STILLS = 4.0, 4  # duration of the film around a scene without cameras, and its stills
+
+
+def orbit_scene(scene: Scene, fps: float, seconds: float | None) -> list[Shot]:
+    """The frames of a turn around a scene without cameras."""
+    state, height = ViewerState(), 1000
+    enter_scene(state, scene)
+    shots = []
+    for fraction in np.linspace(0, 1, max(round((seconds or _ORBIT_SECONDS) * fps), 2)).tolist():
+        camera = cameras.orbit(state.camera, (2 * height * fraction, 0.0), height)
+        shots.append(Shot(camera.cam2world, FIELD_OF_VIEW, len(shots) / fps))
+    return shots
 
 
 @contextlib.contextmanager
@@ -99,14 +111,17 @@ def write_flight(
         fps, seconds: see `list_flight`.
         show_file: called with each file that is written.
     """
-    if tour is None and not len(scene.cam2world):
-        raise InputError("the scene has no input cameras to fly between; give a path to `pansplat render --path`")
     folder.mkdir(parents=True, exist_ok=True)
-    route = plan_visits(scene) if tour is None else plan_route(tour, plan_walk(tour), rest=REST_SECONDS)
-    shots, panoramas = list_flight(route, fps, FIELD_OF_VIEW, seconds), (tour or make_graph(scene)).panoramas
+    if tour is None and not len(scene.cam2world):
+        shots = orbit_scene(scene, fps, seconds)
+        visits, names = {k: k / _ORBIT_STILLS for k in range(_ORBIT_STILLS)}, ["view"] * _ORBIT_STILLS
+    else:
+        route = plan_visits(scene) if tour is None else plan_route(tour, plan_walk(tour), rest=REST_SECONDS)
+        shots, visits = list_flight(route, fps, FIELD_OF_VIEW, seconds), route.visits
+        names = [panorama.label for panorama in (tour or make_graph(scene)).panoramas]
     stills: dict[int, list[str]] = {}
-    for node, at in route.visits.items():
-        still = f"{node + 1:02d}_{make_file_name(panoramas[node].label)}.png"
+    for node, at in visits.items():
+        still = f"{node + 1:02d}_{make_file_name(names[node])}.png"
         stills.setdefault(math.ceil(at * (len(shots) - 1)), []).append(still)
 
     def show(number: int, color: np.ndarray) -> None:

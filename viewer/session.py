@@ -324,7 +324,8 @@ class Session:
             if view is not None and each.image == view[0]:
                 camera, pose = self._state.camera, each.cam2world.double().numpy()
                 moved = replace(camera, position=tuple(pose[:3, 3].tolist()))
-                self._state.camera = cameras.look_along(moved, pose[:3, :3] @ view[1])
+                turned = cameras.focus_on_point(moved, pose[:3, 3] + pose[:3, :3] @ view[1])
+                self._state.camera = replace(turned, distance=camera.distance)
 
     def _face_open_view(self, entry: SceneEntry, index: int) -> None:
         """Turn the start to a wide view, if the panorama has neither a neighbour to look at nor a start view."""
@@ -335,7 +336,7 @@ class Session:
                 forward = find_direction(panorama.cam2world, find_open_view(panorama), 0.0).numpy()
             except InputError:  # it is shown when the photograph is
                 return
-            self._state.camera = self._state.home = cameras.look_along(camera, forward)
+            self._state.camera = self._state.home = cameras.focus_on_point(camera, camera.position + forward)
 
     # --- tours ---
 

@@ -31,6 +31,7 @@ from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable
 from pansplat.tours.camera_path import read_path, write_path
 from pansplat.tours.route import find_angles
+from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.hotspots import Hotspot, find_clicked, find_hotspots
 from pansplat_viewer.core.loader import Find, SceneEntry, SceneLoader
 from pansplat_viewer.core.picking import PickedPoint, compute_pixel_ray, pick_point
@@ -45,7 +46,7 @@ from pansplat_viewer.window.gui import Gui
 from pansplat_viewer.window.input import apply_input, read_input
 from pansplat_viewer.window.recent import add_recent, read_recent
 
-PANORAMA_HEIGHT = 1024  # rows of a screenshot that is a panorama
+PANORAMA_HEIGHT = 1024  # pixels, of screenshots
 _MAX_STEP_SECONDS = 0.25  # longest camera movement of one frame
 _NOTE_COSINE = math.cos(math.radians(5))  # within this angle of the image's middle, a note is there
 
@@ -210,6 +211,12 @@ class Viewer:
         self.session.dismiss()
 
     # --- actions of keys and panels ---
+
+    def focus_center(self) -> None:
+        """Orbit the point in the centre of the image."""
+        point, state = self._pick((0.5, 0.5)), self.state
+        if point is not None:
+            state.camera, state.orbiting = cameras.focus_on_point(state.camera, np.array(point.position)), True
 
     def click(self, place: tuple[float, float]) -> None:
         """Fly to the panorama of the hotspot at a place, or show the point there; fractions of width and height."""

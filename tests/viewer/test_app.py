@@ -5,7 +5,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -15,7 +14,7 @@ from refusals import expect_error
 
 from pansplat_viewer import run
 from pansplat_viewer.app import Options
-from pansplat_viewer.capture import write_flight
+from pansplat_viewer.capture import orbit_scene
 from pansplat_viewer.core.loader import SceneEntry, choose_entry
 
 
@@ -149,7 +148,11 @@ def test_the_size_of_films_is_that_of_the_option(tmp_path):
     assert Options(tmp_path, size="1920X1080").pixels == (1920, 1080)
 
 
-def test_a_film_of_a_scene_without_cameras_is_refused(small_scene, tmp_path):
-    scene = replace(small_scene, cam2world=small_scene.cam2world[:0], names=())
-    expect_error("no input cameras", write_flight, Mock(), scene, None, tmp_path / "out", 24.0, None, print)
-    assert not (tmp_path / "out").exists()
+def test_a_scene_without_cameras_is_orbited(small_scene):
+    scene = replace(small_scene, cam2world=small_scene.cam2world[:0])
+    poses = [shot.pose for shot in orbit_scene(scene, 1.0, 5.0)]
+    middle = np.median(scene.gaussians.means.numpy(), axis=0)
+    for pose in poses:
+        ahead = middle - pose[:3, 3]
+        assert np.allclose(pose[:3, 2], ahead / np.linalg.norm(ahead), atol=1e-6)
+    assert np.allclose(poses[0], poses[-1]) and not np.allclose(poses[0], poses[2])

@@ -266,6 +266,7 @@ def test_clicking_the_widget_changes_the_image(user, label):
 CLICKS = [  # in the window of a pair, and what is then true
     ("click Fly", "state.playing"),
     ("click Fly; click Stop", "not state.playing and 0 < state.flight < 1"),
+    ("key v; drag 500 400 560 400", "state.orbiting and camera.position != home.position"),
     *[(f"click {display}", f"state.settings.display == '{display}'") for display in get_args(Display)],
     ("click depth; slide range 0.5 0.3", "state.settings.display_max > 6"),
     ("drag 500 400 470 400", "camera.yaw_radians > 0 and camera.position == home.position"),
@@ -287,7 +288,7 @@ def test_the_state_after_clicks_and_keys_of_imgui(user):
     io, start, failed = imgui.get_io(), ViewerState(), []
     before = user.read_image()
     for actions, expected in CLICKS:
-        for name in ("playing", "flight", "overlay", "help", "quit", "points", "settings"):
+        for name in ("orbiting", "playing", "flight", "overlay", "help", "quit", "points", "settings"):
             setattr(user.state, name, getattr(start, name))
         user.state.camera, user.state.message = user.state.home, ""
         user.settle()

@@ -216,6 +216,15 @@ ROWS = [  # at the first of two panoramas, which are 0.5 m apart
     ("drag 40 0", "camera.yaw_radians < 0 and camera.position == home.position"),
     ("pan 30 0", "camera.position[0] < 0 and camera.position[2] == approx(0)"),
     ("scroll 1", "camera.vertical_fov_degrees < home.vertical_fov_degrees"),
+    ("press v", "state.orbiting and camera == home"),
+    ("press v; press v", "not state.orbiting"),
+    ("press v; scroll 1", "camera.distance < home.distance"),
+    ("press v; scroll 1", "camera.vertical_fov_degrees == home.vertical_fov_degrees"),
+    *[
+        (f"press v; {turn}", "camera != home and camera.orbit_center == approx(home.orbit_center)")
+        for turn in ("drag 80 10", "scroll 1", *(f"hold {key}" for key in "wasdqe"))
+    ],
+    ("click 0.5 0.5; press f", "state.orbiting and camera.orbit_center == approx(state.points[0].position)"),
     ("press 2; wait 0.6", "state.playing and 0 < camera.position[2] < 0.5"),
     ("press 2; wait 3", "camera.position == approx((0, 0, 0.5)) and state.flight == 1 and not state.playing"),
     ("press 2; wait 3; press 1; wait 3", "camera.position == approx((0, 0, 0)) and abs(camera.yaw_radians) > 3"),
@@ -262,7 +271,7 @@ def act(app: App, text: str) -> None:
             app.frame(**{kind: numbers[0] if kind == "scroll" else numbers})
 
 
-RESET = ("playing", "flight", "overlay", "help", "quit", "path", "points")
+RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "path", "points")
 
 
 def test_the_state_of_the_window_after_what_a_user_does(app):
@@ -506,7 +515,7 @@ def test_the_view_of_a_photograph_is_kept_when_its_scene_is_there(make_app, pair
     camera = app.state.camera
     gate.open()
     app.until(lambda: app.content is small_scene, "scene")
-    assert camera.yaw_radians > 0.1 and app.state.camera == camera
+    assert camera.yaw_radians > 0.1 and app.state.camera == replace(camera, distance=app.state.camera.distance)
 
 
 def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):

@@ -1,4 +1,4 @@
-"""The interactive camera (yaw, pitch), and the pinhole cameras of images and cube faces.
+"""The interactive camera (yaw, pitch, orbit), and the pinhole cameras of images and cube faces.
 
 Pure functions without window or GL.
 
@@ -17,6 +17,7 @@ from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.path import turn_axes
 
 MAX_PITCH_RADIANS = math.radians(MAX_PITCH_DEGREES)
+MIN_DISTANCE = 0.05  # metres, from the orbit centre
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Camera:
     pitch_radians: float = 0.0  # angle above the horizon
     vertical_fov_degrees: float = 75.0  # vertical field of view
     level: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    distance: float = 2.0  # from the camera to the orbit centre ahead, metres
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
@@ -45,6 +47,11 @@ class Camera:
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = self.position
         return matrix
+
+    @property
+    def orbit_center(self) -> Float[np.ndarray, "3"]:
+        """The orbit centre, metres."""
+        return np.asarray(self.position) + self.distance * self.rotation[:, 2]
 
     def find_focal(self, height: int) -> float:
         """The focal length of an image with this height, pixels."""
@@ -84,17 +91,36 @@ def fly(camera: Camera, right: float, up: float, forward: float) -> Camera:
     return replace(camera, position=_triple(np.asarray(camera.position) + step))
 
 
+def orbit(camera: Camera, pixels: tuple[float, float], height: int) -> Camera:
+    """Turn around the orbit centre; a drag over the window's height is half a turn."""
+    radians_per_pixel = math.pi / max(height, 1)
+    center = camera.orbit_center
+    turned = turn(camera, pixels[0] * radians_per_pixel, -pixels[1] * radians_per_pixel)
+    return replace(turned, position=_triple(center - camera.distance * turned.rotation[:, 2]))
+
+
+def dolly(camera: Camera, steps: float) -> Camera:
+    """Move towards (positive) or away from the orbit centre by 10% of the distance per step."""
+    center = camera.orbit_center
+    distance = max(camera.distance * 0.9**steps, MIN_DISTANCE)
+    return replace(camera, distance=distance, position=_triple(center - distance * camera.rotation[:, 2]))
+
+
 def zoom(camera: Camera, steps: float) -> Camera:
     """Narrow (positive) or widen the field of view by 8% per step."""
     fov = min(max(camera.vertical_fov_degrees * 0.92**steps, MIN_FOV_DEGREES), MAX_FOV_DEGREES)
     return replace(camera, vertical_fov_degrees=fov)
 
 
-def look_along(camera: Camera, direction: Float[np.ndarray, "3"]) -> Camera:
-    """Turn the camera to a unit direction."""
-    right, down, forward = np.asarray(camera.level).T @ direction
-    pitch = _clamp(math.asin(_clamp(-float(down), 1.0)), MAX_PITCH_RADIANS)
-    return replace(camera, yaw_radians=math.atan2(right, forward), pitch_radians=pitch)
+def focus_on_point(camera: Camera, point: Float[np.ndarray, "3"]) -> Camera:
+    """Look at a point and make it the orbit centre; a point at the camera's position changes nothing."""
+    offset = np.asarray(camera.level).T @ (np.asarray(point) - np.asarray(camera.position))
+    distance = float(np.linalg.norm(offset))
+    if distance < 1e-6:
+        return camera
+    yaw = math.atan2(offset[0], offset[2])
+    pitch = _clamp(math.asin(_clamp(-offset[1] / distance, 1.0)), MAX_PITCH_RADIANS)
+    return replace(camera, yaw_radians=yaw, pitch_radians=pitch, distance=max(distance, MIN_DISTANCE))
 
 
 def _clamp(value: float, limit: float) -> float:

@@ -21,8 +21,8 @@ from pansplat_viewer.core.camera import Camera, move_to_pose
 from pansplat_viewer.core.picking import PickedPoint
 from pansplat_viewer.core.settings import Display, DrawSettings
 
-KEY_SECONDS = 2.0  # time between key frames that are added one after the other
-_MAX_SAMPLES = 100_000  # most Gaussians that a percentile is measured on
+KEY_SECONDS = 2.0  # between key frames that are added one after the other
+_MAX_SAMPLES = 100_000  # Gaussians that percentiles are measured on
 
 
 @dataclass
@@ -40,6 +40,7 @@ class ViewerState:
 
     camera: Camera = field(default_factory=Camera)  # the current camera; `home` is the camera that R restores
     home: Camera = field(default_factory=Camera)
+    orbiting: bool = False  # whether the camera orbits (True) or flies (False)
     settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
     flight: float = 0.0  # fraction of `route`, in [0, 1]
     playing: bool = False  # whether the camera follows it
@@ -111,9 +112,10 @@ def enter_scene(state: ViewerState, scene: Scene, tour: TourGraph | None = None,
         state.route, level = plan_route(graph, walk), graph.level_axes
         pose = state.route.pose(0.0)
     levelled = replace(state.camera, level=tuple(tuple(row) for row in level.tolist()))
-    state.home = move_to_pose(levelled, pose)
-    state.camera = before or state.home
-    state.depth_max = _measure_depth(scene)
+    home = move_to_pose(levelled, pose)
+    state.home = replace(home, distance=_measure_distance(scene, 50))
+    state.camera = state.home if before is None else replace(before, distance=state.home.distance)
+    state.depth_max = _measure_distance(scene, 98)
     choose_display(state, state.settings.display)
 
 
@@ -150,7 +152,7 @@ def limit_camera(state: ViewerState, before: Camera) -> None:
     At a panorama of a tour that no edge leads to, it stays where it is.
     """
     graph, camera = state.graph, state.camera
-    if graph is None or camera.position == before.position:
+    if graph is None or state.orbiting or camera.position == before.position:
         return
     place = np.array(before.position)
     first, last = graph.find_nearest_edge(place)[0]
@@ -159,7 +161,7 @@ def limit_camera(state: ViewerState, before: Camera) -> None:
     state.camera = replace(camera, position=tuple(place.tolist()))
     if not state.is_tour and not state.has_stopped and not np.allclose(place, camera.position):
         state.has_stopped = True
-        state.show_message("Surfaces stop the camera: no photograph shows what is behind them")
+        state.show_message("Surfaces stop the camera: no photograph shows what is behind them   (V: orbit around them)")
 
 
 def go_to_view(state: ViewerState, view: int) -> None:
@@ -231,14 +233,14 @@ def _choose_outside_pose(scene: Scene) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
-def _measure_depth(scene: Scene) -> float:
-    """The distance from the first camera (else of the start pose) within which 98 % of the Gaussians are, metres."""
+def _measure_distance(scene: Scene, percent: float) -> float:
+    """Return a percentile of the distances from the first camera (else the start pose), metres; 2 if none."""
     means = _sample_means(scene)
     if not len(means):
         return 2.0
     if len(scene.cam2world):
-        return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), 98)
-    return 2 * _measure_percentile(means, np.median(means, axis=0), 98)
+        return _measure_percentile(means, scene.cam2world[0, :3, 3].double().numpy(), percent)
+    return 2 * _measure_percentile(means, np.median(means, axis=0), percent)
 
 
 def _sample_means(scene: Scene) -> Float[np.ndarray, "m 3"]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 SLOW = 0.2  # factor of the speed while Alt is held
 _CLICK_PIXELS = 3.0  # a longer way of the pointer with the button down is a drag
-PAN_METRES = 2.0  # movement by a pan over the height of the window
+ORBIT_KEY_PIXELS = 400.0  # per second, of a window 1000 pixels high
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,11 @@ def _toggle(name: str) -> Action:
     return lambda viewer, _: setattr(viewer.state, name, not getattr(viewer.state, name))
 
 
+def _queue(name: str) -> Action:
+    """Call a method of the viewer at the end of the frame."""
+    return lambda viewer, _: viewer.queue(getattr(viewer, name))
+
+
 def _write_screenshot(viewer: Viewer, events: Input) -> None:
     viewer.queue(viewer.write_screenshot, "exr" if "shift" in events.held else "png")
 
@@ -96,10 +101,12 @@ KEYS = (
     KeyRow("W A S D", "fly forward, left, back, right", dict.fromkeys((*"wasd", "up", "left", "down", "right"))),
     KeyRow("Q E", "fly down, up", dict.fromkeys("qe")),
     KeyRow("Shift, Alt", "faster, slower"),
-    KeyRow("drag", "look around"),
+    KeyRow("drag", "look around (orbit: turn)"),
     KeyRow("click", "distance of a point; twice: the distance between both"),
     KeyRow("right drag", "pan"),
-    KeyRow("scroll", "field of view"),
+    KeyRow("scroll", "field of view (orbit: distance)"),
+    KeyRow("V", "orbit or fly", {"v": _toggle("orbiting")}),
+    KeyRow("F", "focus the point in the centre", {"f": _queue("focus_center")}),
     KeyRow("1 2 ... 9", "go to a panorama", {str(n + 1): _change(go_to_view, n) for n in range(9)}),
     KeyRow(
         "PgDn, PgUp",
@@ -182,14 +189,26 @@ def _move_camera(state: ViewerState, events: Input) -> None:
     )
     factor = (FAST if "shift" in held else 1.0) * (SLOW if "alt" in held else 1.0)
     camera = state.camera
-    if axes.any():
-        camera = cameras.fly(camera, *(axes * WALK_SPEED * factor * events.seconds))
-    if any(events.drag):
-        camera = cameras.turn_by_drag(camera, events.drag, events.height)
-    if events.scroll:
-        camera = cameras.zoom(camera, events.scroll)
+    if state.orbiting:
+        pixels = ORBIT_KEY_PIXELS * events.seconds * factor * events.height / 1000
+        if axes[:2].any():
+            camera = cameras.orbit(camera, (-axes[0] * pixels, axes[1] * pixels), events.height)
+        if axes[2]:
+            camera = cameras.dolly(camera, axes[2] * 6 * events.seconds * factor)
+        if any(events.drag):
+            camera = cameras.orbit(camera, events.drag, events.height)
+        if events.scroll:
+            camera = cameras.dolly(camera, events.scroll)
+    else:
+        step = axes * WALK_SPEED * factor * events.seconds
+        if axes.any():
+            camera = cameras.fly(camera, *step)
+        if any(events.drag):
+            camera = cameras.turn_by_drag(camera, events.drag, events.height)
+        if events.scroll:
+            camera = cameras.zoom(camera, events.scroll)
     if any(events.pan):
-        metres = PAN_METRES / max(events.height, 1)
+        metres = camera.distance / max(events.height, 1)
         camera = cameras.fly(camera, -events.pan[0] * metres, events.pan[1] * metres, 0.0)
     before, state.camera = state.camera, camera
     limit_camera(state, before)

@@ -60,15 +60,26 @@ def test_fly_moves_along_the_view_and_along_the_up_axis_of_the_scene():
     assert np.allclose(cameras.fly(camera, 0, 1, 0).position, -np.asarray(Z_UP)[:, 1])
 
 
+def test_dolly_approaches_the_centre_and_does_not_pass_it():
+    camera = replace(Camera(), distance=1.0)
+    near = cameras.dolly(camera, 1)
+    assert near.distance == pytest.approx(0.9) and near.position[2] == pytest.approx(0.1)
+    nearest = cameras.dolly(camera, 1000)
+    assert nearest.distance == cameras.MIN_DISTANCE
+    assert np.allclose(nearest.orbit_center, camera.orbit_center)
+
+
 def test_zoom_stays_within_its_bounds():
     assert cameras.zoom(Camera(), 1).vertical_fov_degrees < Camera().vertical_fov_degrees
     assert cameras.zoom(Camera(), 1e3).vertical_fov_degrees == cameras.MIN_FOV_DEGREES
     assert cameras.zoom(Camera(), -1e3).vertical_fov_degrees == cameras.MAX_FOV_DEGREES
 
 
-def test_the_camera_looks_along_a_direction():
-    direction = np.array((0.48, -0.6, 0.64))
-    assert np.allclose(cameras.look_along(replace(Camera(), level=Z_UP), direction).rotation[:, 2], direction)
+def test_focus_looks_at_the_point_and_orbits_it():
+    point = np.array((2.0, -1.0, 3.0))
+    camera = cameras.focus_on_point(replace(Camera(), position=(0.5, 0, 0)), point)
+    assert np.allclose(camera.orbit_center, point)
+    assert cameras.focus_on_point(camera, np.asarray(camera.position)) == camera
 
 
 def test_a_scene_is_entered_in_the_direction_of_its_start_view(small_scene):
