@@ -60,6 +60,15 @@ def skew(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     return np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=-1).reshape(*vectors.shape[:-1], 3, 3)
 
 
+def make_motion(
+    rotation: Float[Array, "*batch 3 3"], translation: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 4 4"]:
+    """Matrices of rigid motions x2 = R x1 + t."""
+    motion = np.zeros((*rotation.shape[:-2], 4, 4))
+    motion[..., :3, :3], motion[..., :3, 3], motion[..., 3, 3] = rotation, translation, 1
+    return motion
+
+
 def rotation_exp(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """Rotation matrices of rotation vectors, radians. Source: Rodrigues' formula."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]

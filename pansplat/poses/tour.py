@@ -21,7 +21,7 @@ from numpy import ndarray as Array
 
 from pansplat.poses.bundle import Bundle, adjust, point_depths, residual_angles, triangulate
 from pansplat.poses.features import Features
-from pansplat.poses.solvers import rotation_angle
+from pansplat.poses.solvers import make_motion, rotation_angle
 from pansplat.poses.two_view import RelativePose
 from pansplat.system.components import label_components
 
@@ -157,7 +157,8 @@ def _find_junction(
     """
     between = []
     for (i, j), relation in relations.items():
-        motions, odds = _hypotheses(relation)
+        likely = relation.hypotheses.log_odds > _LEAST_ODDS
+        motions, odds = relation.hypotheses.motions[likely], relation.hypotheses.log_odds[likely]
         if i in first and j in second:
             between.append((i, j, motions, odds))
         elif j in first and i in second:
@@ -180,15 +181,6 @@ def _find_junction(
     return float(evidence[best] - np.logaddexp.reduce(np.append(rivals, 0.0))), found[best]
 
 
-def _hypotheses(relation: RelativePose) -> tuple[Float[Array, "n 4 4"], Float[Array, "n"]]:
-    """Motions from the first camera's frame to the second one's, and the logarithms of their odds."""
-    known = relation.hypotheses
-    likely = known.log_odds > _LEAST_ODDS
-    motions = np.tile(np.eye(4), (int(likely.sum()), 1, 1))
-    motions[:, :3, :3], motions[:, :3, 3] = known.rotations[likely], known.translations[likely]
-    return motions, known.log_odds[likely]
-
-
 def _agree(
     first: Float[Array, "n 4 4"], second: Float[Array, "m 4 4"], turn: float, gap: tuple[float, float]
 ) -> Bool[Array, "n m"]:
@@ -207,9 +199,7 @@ def _confirm(parts: Sequence[_Part], relations: Mapping[IndexPair, RelativePose]
         for (i, j), relation in relations.items():
             if i in part and j in part and relation.is_doubtful and relation.is_matched:
                 motion = np.linalg.inv(part[j]) @ part[i]
-                own = np.eye(4)
-                own[:3, :3], own[:3, 3] = relation.rotation, relation.distance * relation.translation
-                if _agree(motion[None], own[None], _JOINED_TURN, _JOINED_GAP)[0, 0]:
+                if _agree(motion[None], relation.motion[None], _JOINED_TURN, _JOINED_GAP)[0, 0]:
                     confirmed[i, j] = replace(relation, problem=None)
     return confirmed
 
@@ -232,11 +222,10 @@ def _closes(kept: Mapping[IndexPair, RelativePose], relation: RelativePose, pair
     first, second = _motion_between(kept, pair[0], k), _motion_between(kept, k, pair[1])
     if first is None or second is None:
         return None
-    turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))
-    translation = second[0] @ first[1] + second[1]
-    length = relation.distance + float(np.linalg.norm(first[1]) + np.linalg.norm(second[1]))
-    gap = float(np.linalg.norm(translation - relation.distance * relation.translation))
-    return turn < _LARGEST_LOOP and gap < _LARGEST_GAP * length
+    around, own = second @ first, relation.motion
+    turn = float(rotation_angle(around[:3, :3] @ own[:3, :3].T))
+    length = sum(float(np.linalg.norm(motion[:3, 3])) for motion in (own, first, second))
+    return turn < _LARGEST_LOOP and float(np.linalg.norm(around[:3, 3] - own[:3, 3])) < _LARGEST_GAP * length
 
 
 def _connect(count: int, relations: Mapping[IndexPair, RelativePose]) -> list[set[int]]:
@@ -260,10 +249,9 @@ def _place_group(
         if len(placed) > 2:
             bundle = adjust(bundle, noise)
         bundle = bundle.select(residual_angles(bundle) < _OUTLIER * noise)
-    poses = np.tile(np.eye(4), (len(placed), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = bundle.rotations, bundle.centres
     order = np.argsort(placed)
-    return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(bundle), residual_angles(bundle))
+    poses = make_motion(bundle.rotations, bundle.centres)[order]
+    return Group(tuple(int(placed[i]) for i in order), poses, point_depths(bundle), residual_angles(bundle))
 
 
 def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None, str]:
@@ -296,16 +284,11 @@ def _find_contradictions(relations: Mapping[IndexPair, RelativePose]) -> tuple[I
     return tuple(rejected)
 
 
-def _motion_between(
-    kept: Mapping[IndexPair, RelativePose], i: int, j: int
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
-    """Rotation and translation, camera heights, from one camera to another one."""
-    if (i, j) in kept:
-        return kept[i, j].rotation, kept[i, j].distance * kept[i, j].translation
-    if (j, i) in kept:
-        back = kept[j, i].rotation.T
-        return back, -kept[j, i].distance * back @ kept[j, i].translation
-    return None
+def _motion_between(known: Mapping[IndexPair, RelativePose], i: int, j: int) -> Float[Array, "4 4"] | None:
+    """The motion from one camera's frame to another one's, camera heights; None if it is not known."""
+    if (i, j) in known:
+        return known[i, j].motion
+    return np.linalg.inv(known[j, i].motion) if (j, i) in known else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,7 +337,7 @@ class _GrowingGroup:
         self._observations, self._relations, self._downs, self._noise = observations, relations, downs, noise
         start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
         self.placed = [start[0]]
-        self._triangulate([np.eye(3)], [np.zeros(3)])
+        self._triangulate(np.eye(4)[None])
         self._add(start[1])
 
     def grow(self) -> None:
@@ -385,25 +368,24 @@ class _GrowingGroup:
 
     def _add(self, view: int) -> None:
         """Place a panorama where its relations to placed ones do, the strongest of those that agree most."""
+        poses = make_motion(self.bundle.rotations, self.bundle.centres)
         places = []
-        for other, rotation, origin in zip(self.placed, self.bundle.rotations, self.bundle.centres, strict=True):
+        for other, pose in zip(self.placed, poses, strict=True):
             motion = _motion_between(self._relations, view, other)
             if motion is not None:
-                pair = (view, other) if (view, other) in self._relations else (other, view)
-                places.append((rotation @ motion[0], origin + rotation @ motion[1], self._relations[pair]))
+                places.append((pose @ motion, self._relations[min(view, other), max(view, other)]))
         support = [
             sum(
                 other.score
-                for _, centre, other in places
-                if np.linalg.norm(centre - place[1]) < _AGREEING_PLACES * (place[2].distance + other.distance) / 2
+                for place, other in places
+                if np.linalg.norm((place - own)[:3, 3]) < _AGREEING_PLACES * (relation.distance + other.distance) / 2
             )
-            for place in places
+            for own, relation in places
         ]
-        rotation, centre, _ = places[int(np.argmax(support))]
         self.placed.append(view)
-        self._triangulate([*self.bundle.rotations, rotation], [*self.bundle.centres, centre])
+        self._triangulate(np.concatenate((poses, places[int(np.argmax(support))][0][None])))
 
-    def _triangulate(self, rotations: Sequence[Array], centres: Sequence[Array]) -> None:
+    def _triangulate(self, poses: Float[Array, "view 4 4"]) -> None:
         """Make the bundle of the placed panoramas at these poses."""
         observations = self._observations
         position = np.full(len(self._downs), -1)
@@ -413,7 +395,7 @@ class _GrowingGroup:
         kept &= counts[observations.track] >= 2
         tracks, point = np.unique(observations.track[kept], return_inverse=True)
         point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
-        rotation, centre = np.stack(rotations), np.stack(centres)
+        rotation, centre = poses[:, :3, :3], poses[:, :3, 3]
         points = triangulate(rotation, centre, camera, point, bearing, len(tracks))
         downs = self._downs[self.placed]
         world = np.einsum("nij,nj->ni", rotation, downs)

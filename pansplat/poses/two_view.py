@@ -35,6 +35,7 @@ from pansplat.poses.solvers import (
     decompose_essential,
     epipolar_angles,
     essential_from_five,
+    make_motion,
     rotation_angle,
     rotation_exp,
     skew,
@@ -43,62 +44,48 @@ from pansplat.poses.solvers import (
     upright_from_two,
 )
 
-_WIDE_SHARE, _WIDE = 0.3, 3.0  # share of right matches of larger error, and how many times larger
-_MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
-_DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # of stitched panoramas: deviation and correlation length, radians
-_TAIL = 2.0  # degrees of freedom of the distribution of a match's own error
-_MAX_POLISHED, _MIN_POLISHED, _MIN_PROBABILITY = 1000, 8, 0.2  # matches of the polish; probability of each to be right
-_POLISH_SIZE = 7.0  # pixels; of a feature with 1.4 times the noise of a small one
+# Limits are chosen on the 78 pairs of zind, and numbers of samples on tours of generated homes (docs/poses.md).
+_WIDE_SHARE, _WIDE = 0.3, 3.0  # share of right matches with a larger error, and how many times larger it is
+_MAX_ANGLE = 4.0  # matches with a larger residual are wrong; in deviations of the larger error
+_DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # stitching: standard deviation and correlation length, radians
+_TAIL = 2.0  # degrees of freedom of Student's t, the distribution of a match's own error in the polish
+_MAX_POLISHED, _MIN_POLISHED = 1000, 8  # largest and smallest number of matches of the polish
+_MIN_PROBABILITY = 0.2  # matches that are less probably right have no part in the polish
+_POLISH_SIZE = 7.0  # pixels; a feature of this size has 1.4 times the noise of a small one
 _POLISH_WINDOW = 0.035  # largest residual, radians; what lies beyond the noise gives the density of wrong matches
-_POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # of the noise; steps with each
-_SHARE_STEPS = 4  # of expectation and maximisation, for the shares of right matches
-_POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of the groups of matches
-_POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right matches in the window, a priori
-_POLISH_WEIGHT = 4.0  # of these shares, in matches
+_POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # the noise is enlarged by each factor in turn, for so many steps
+_SHARE_STEPS = 4  # rounds of expectation and maximisation that find the shares of right matches
+_POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of the prior between groups of matches
+_POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # share of right matches in each group, a priori
+_POLISH_WEIGHT = 4.0  # the shares a priori count like so many matches
 _CALIBRATION = 1.5, 80.0  # formal standard deviations are multiplied by the larger of 1.5 and 80 / places
-_MIN_MATCHES, _MAX_MATCHES = 8, 2500
-_TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
-_SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
+_MIN_MATCHES, _MAX_MATCHES = 8, 2500  # smallest and largest number of matches that a pose is sought from
+_TOP_SETS = (40, 80, 160, 320, 640, 2500)  # samples are drawn from so many best matches
+_SAMPLES = {5: 150, 3: 1200, 2: 600}  # number of samples from each set, by the matches in a sample
 _QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
 _LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
-_KEPT, _KEPT_PARALLEL = 10, 6  # hypotheses that are optimised: of all kinds, and of those with parallel walls
+_KEPT, _KEPT_PARALLEL = 10, 6  # hypotheses that are optimised: all kinds of samples, and those with parallel walls
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
-_MIN_PARALLAX = 5.0  # in the noise's standard deviation
-_MAX_UNCERTAINTY = math.radians(4)
-_FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisation of a hypothesis
-_DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
-_EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
-_SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
-_SAME_ESSENTIAL, _COMPARED_ESSENTIALS = 0.998, 2000  # cosine of equal ones as vectors (3.6 degrees); best ones
+_MIN_PARALLAX = 5.0  # least parallax of two places, in standard deviations of the noise
+_MAX_UNCERTAINTY = math.radians(4)  # largest standard deviation of the direction
+# Hypotheses are optimised with the noise enlarged by each factor in turn: of samples, with parallel walls, by depth.
+_FACTORS, _PARALLEL_FACTORS, _DEPTH_FACTORS = (2, 1), (4, 2, 1), (24, 6, 2, 1)
+_EQUAL_SCORE = 0.9  # a lower score may win by parallel walls, because matches on one object share an error
+_SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # equal hypotheses differ by less
+_SAME_ESSENTIAL = 0.998  # cosine of two essential matrices as vectors, above which they are equal (3.6 degrees)
+_COMPARED_ESSENTIALS = 2000  # best essential matrices among which different ones are sought
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED_PLACES, _NEEDED_SCORE, _NEEDED_MARGIN = 32, 80, 20
-
-
-@dataclass(frozen=True)
-class _Support:
-    """How much the matches support a pose; see `RelativePose`."""
-
-    places: float
-    score: float
-    margin: float
-
-    @property
-    def suffices(self) -> bool:
-        """Whether the matches alone support the pose."""
-        return self.places >= _NEEDED_PLACES and self.score >= _NEEDED_SCORE and self.margin >= _NEEDED_MARGIN
-
-
 _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the translation),
-# whether it is that of a comparison (docs/poses.md).
+# whether it is that of a comparison. Fitted to 287 pairs (docs/poses.md).
 _ODDS = (-32.94, 0.73, 1.39, 3.95, -2.41, 7.65, -0.38, 4.57, -0.75, -1.73, -1.7)
-_LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
-_NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; translation, camera heights, and relative
-_PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
-_PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
-_LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
+_LEAST_CONFLICT, _LEAST_SLOPE, _LARGEST_SLOPE = 0.003, 0.01, 0.3
+_NEAR = math.radians(4), 0.25, 0.15  # poses are one within: rotation; translation, camera heights, or relative
+_PREFERENCE = 2.0  # a pose by matches wins over a proposal whose log-odds are higher by less
+_PROPOSAL_NOISE = math.radians(0.5), 0.1  # standard deviations of a proposal: rotation; position, camera heights
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0  # least log-odds of each
 _SHOWN_ODDS = 0.0  # above which messages state the probability; a pose that is rather wrong than right has none
 
 
@@ -119,6 +106,11 @@ class Hypothesis:
     probability: Float[Array, "match"]
     distance: float = math.nan
     is_proposed: bool = False
+
+    @property
+    def motion(self) -> Float[Array, "4 4"]:
+        """From the first camera's frame to the second one's, camera heights."""
+        return make_motion(self.rotation, self.distance * self.translation)
 
 
 def _match_noise(first: Features, second: Features, indices: Int[Array, "match 2"]) -> Float[Array, "match"]:
@@ -514,12 +506,11 @@ class Hypotheses:
     """Relative poses of two panoramas, of which at most one is right: a row for each compared `Hypothesis`.
 
     Attributes:
-        rotations, translations: x2 = R x1 + t, camera heights.
+        motions: from the first camera's frame to the second one's, camera heights.
         log_odds: logarithm of the odds of each against none.
     """
 
-    rotations: Float[Array, "n 3 3"] = field(default_factory=lambda: np.empty((0, 3, 3)))
-    translations: Float[Array, "n 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    motions: Float[Array, "n 4 4"] = field(default_factory=lambda: np.empty((0, 4, 4)))
     log_odds: Float[Array, "n"] = field(default_factory=lambda: np.empty(0))
 
 
@@ -531,7 +522,6 @@ class RelativePose:
         rotation, translation: x2 = R x1 + t; |t| = 1.
         indices: features of the matches that agree with it; none if it is that of a comparison.
         score: natural logarithm of the likelihood ratio against chance.
-        margin: how much the score exceeds that of the best different pose.
         places: number of different places (12 degrees) with right matches, in the panorama that has fewer.
         parallax: 90 % quantile of the parallax of these matches, radians.
         uncertainty: standard deviations of rotation and direction by the noise of the matches, the distortion of the
@@ -546,7 +536,6 @@ class RelativePose:
     translation: Vector
     indices: Int[Array, "match 2"]
     score: float = 0.0
-    margin: float = 0.0
     places: float = 0.0
     parallax: float = 0.0
     uncertainty: tuple[float, float] = (math.inf, math.inf)
@@ -554,6 +543,11 @@ class RelativePose:
     log_odds: float = -math.inf
     problem: str | None = None
     hypotheses: Hypotheses = Hypotheses()
+
+    @property
+    def motion(self) -> Float[Array, "4 4"]:
+        """From the first camera's frame to the second one's, camera heights."""
+        return make_motion(self.rotation, self.distance * self.translation)
 
     @property
     def is_matched(self) -> bool:
@@ -609,14 +603,23 @@ def estimate_relative_pose(
     odds = np.array([_log_odds(h, evidence) for h in compared])
     best, log_odds = _choose_compared(compared, odds)
     # Matches that suffice decide alone: the odds also use estimated depths, which are wrong for a camera on stairs.
-    if _find_support(found[0], found, evidence).suffices:
-        best = found[0]
-    hypotheses = Hypotheses(
-        np.stack([h.rotation for h in compared]), np.stack([h.distance * h.translation for h in compared]), odds
+    if _suffice(found, evidence):
+        best, log_odds = found[0], math.inf
+    places = _count_all_places(best, evidence)
+    relation = RelativePose(
+        best.rotation,
+        best.translation,
+        indices[:0],
+        score=best.score,
+        places=places,
+        uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)),
+        distance=best.distance,
+        log_odds=log_odds,
+        problem=None if log_odds >= _PROBABLE_ODDS else _describe_doubt(places, log_odds),
+        hypotheses=Hypotheses(np.stack([h.motion for h in compared]), odds),
     )
     if best.is_proposed:
-        return _as_proposed(best, log_odds, hypotheses, evidence)
-    support = _find_support(best, found, evidence)
+        return relation
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
@@ -624,48 +627,23 @@ def estimate_relative_pose(
     rotation, translation, deviations = polish_pose(
         a[used], b[used], best.rotation, best.translation, evidence.noise[used], axes
     )
-    uncertainty = _calibrate(deviations, support.places)
-    problem = _find_problem(support, log_odds)
-    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
-        problem, hypotheses = (
-            f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees",
-            Hypotheses(),
-        )
-    elif problem is None and surroundings is not None and not math.isfinite(best.distance):
-        problem = "the distance of the cameras cannot be determined"
-    elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
-        problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
-    return RelativePose(
-        rotation,
-        translation,
-        indices[right],
-        score=best.score,
-        margin=support.margin,
-        places=support.places,
+    uncertainty = _calibrate(deviations, places)
+    relation = replace(
+        relation,
+        rotation=rotation,
+        translation=translation,
+        indices=indices[right],
         parallax=spread,
         uncertainty=uncertainty,
-        distance=best.distance,
-        log_odds=math.inf if support.suffices else log_odds,
-        problem=problem,
-        hypotheses=hypotheses,
     )
-
-
-def _as_proposed(best: Hypothesis, log_odds: float, hypotheses: Hypotheses, evidence: _Evidence) -> RelativePose:
-    """The relative pose of a comparison, which has no matches."""
-    support = _Support(_count_all_places(best, evidence), best.score, 0.0)
-    return RelativePose(
-        best.rotation,
-        best.translation,
-        np.empty((0, 2), np.int64),
-        score=best.score,
-        places=support.places,
-        uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)),
-        distance=best.distance,
-        log_odds=log_odds,
-        problem=_find_problem(support, log_odds),
-        hypotheses=hypotheses,
-    )
+    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
+        problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
+        return replace(relation, problem=problem, hypotheses=Hypotheses())
+    if relation.is_reliable and surroundings is not None and not math.isfinite(best.distance):
+        return replace(relation, problem="the distance of the cameras cannot be determined")
+    if relation.is_reliable and uncertainty[1] > _MAX_UNCERTAINTY:
+        return replace(relation, problem=f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees")
+    return relation
 
 
 def _choose_compared(compared: Sequence[Hypothesis], odds: Float[Array, "n"]) -> tuple[Hypothesis, float]:
@@ -680,8 +658,7 @@ def _choose_compared(compared: Sequence[Hypothesis], odds: Float[Array, "n"]) ->
 
 def _are_near(first: Hypothesis, second: Hypothesis) -> bool:
     """Whether two hypotheses state one pose, by the distance of the cameras, too."""
-    translations = [h.distance * h.translation for h in (first, second)]
-    gap = float(np.linalg.norm(translations[0] - translations[1]))
+    gap = float(np.linalg.norm(first.motion[:3, 3] - second.motion[:3, 3]))
     longest = max(first.distance, second.distance)
     turned = rotation_angle(first.rotation @ second.rotation.T)
     return first is second or bool(turned < _NEAR[0] and gap < max(_NEAR[1], _NEAR[2] * longest))
@@ -691,7 +668,7 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
     """Logarithm of the odds of a hypothesis against none; -inf if the panoramas cannot be compared."""
     if evidence.surroundings is None or not math.isfinite(hypothesis.distance):
         return -math.inf
-    translation = hypothesis.distance * hypothesis.translation
+    translation = hypothesis.motion[:3, 3]
     comparison = compare(*evidence.surroundings, hypothesis.rotation, translation)
     slope = abs(float(hypothesis.translation @ (hypothesis.rotation @ evidence.axes.first.axes[0])))
     values = (
@@ -714,23 +691,22 @@ def _count_all_places(hypothesis: Hypothesis, evidence: _Evidence) -> float:
     return min(_count_places(rays, hypothesis.probability) for rays in (evidence.a, evidence.b))
 
 
-def _find_support(best: Hypothesis, found: Sequence[Hypothesis], evidence: _Evidence) -> _Support:
-    """How much the matches support one of the hypotheses."""
-    margin = best.score - max((h.score for h in found if h is not best), default=0.0)
-    return _Support(_count_all_places(best, evidence), best.score, margin)
+def _suffice(found: Sequence[Hypothesis], evidence: _Evidence) -> bool:
+    """Whether the matches alone support the first hypothesis, which has the highest score."""
+    best, margin = found[0], found[0].score - (found[1].score if len(found) > 1 else 0.0)
+    is_clear = best.score >= _NEEDED_SCORE and margin >= _NEEDED_MARGIN
+    return is_clear and _count_all_places(best, evidence) >= _NEEDED_PLACES
 
 
-def _find_problem(support: _Support, log_odds: float) -> str | None:
-    """Why a pose must not be used; None if its matches suffice, or with the comparison of both panoramas."""
-    if support.suffices or log_odds >= _PROBABLE_ODDS:
-        return None
+def _describe_doubt(places: float, log_odds: float) -> str:
+    """Why a pose must not be used whose matches do not suffice, also with the comparison of both panoramas."""
     outcome = "too uncertain to use"
     if log_odds > _SHOWN_ODDS:
         probability, needed = (100 / (1 + math.exp(-odds)) for odds in (log_odds, _PROBABLE_ODDS))
         outcome = f"right with a probability of {probability:.0f} %, and {needed:.0f} % are needed"
     return (
-        f"too little in common: {support.places:.0f} places match where {_NEEDED_PLACES:g} suffice, and the best pose "
-        f"is {outcome}"
+        f"too little in common: {places:.0f} places match where {_NEEDED_PLACES:g} suffice, and the best pose is "
+        f"{outcome}"
     )
 
 
