@@ -33,10 +33,10 @@ from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.pose_file import (
     format_pose_file,
     make_pose_content,
-    make_pose_file,
     make_range,
     mark_worlds,
     matrix_of,
+    rename_panoramas,
     world_of,
 )
 from pansplat.system.atomic import replacing
@@ -97,7 +97,8 @@ class PoseEditor:
         if self.file.exists():
             return read_pose_content(self.file)
         (source,) = self._sources
-        return _convert(read_entry(source), self._names, self._by_name)
+        names = {name: self._names[image] for name, image in self._by_name.items()}
+        return rename_panoramas(read_entry(source), names, {name: i.name for name, i in self._by_name.items()})
 
     def read_unit(self, world: int) -> float | None:
         """Metres that are one camera height of the estimated depths in a world, if the file states it."""
@@ -268,22 +269,6 @@ def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
             file = locate_inside(path.parent, os.path.abspath(image), path)
             names[image] = file.relative_to(path.parent).as_posix()
     return names
-
-
-def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, Path]) -> Content:
-    """A cached estimate as the content of a poses.json."""
-
-    def rename(name: str) -> str:
-        return names[by_name[name]] if name in by_name else name
-
-    worlds = [
-        world | {"poses": {rename(name): pose for name, pose in world["poses"].items()}} for world in cached["worlds"]
-    ]
-    approximate = [
-        about | {key: [*map(rename, about[key])] for key in ("between", "by")} for about in cached["approximate"]
-    ]
-    unplaced = {by_name[name].name if name in by_name else name: reason for name, reason in cached["unplaced"].items()}
-    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, "approximate": approximate})
 
 
 def _find_free_world(content: Content, former: Sequence[Any] = ()) -> int:
