@@ -2,8 +2,9 @@
 
 Each match is evidence: the logarithm of the likelihood of its epipolar angle under a pose, over its likelihood by
 chance. The prior probability that a match is right follows from its ratio. The sum over all matches, the score, ranks
-the hypotheses of the minimal solvers, and measures whether the best one can be chance. Hypotheses come from five
-matches, and, because panoramas of tours are upright, from three and from two matches of levelled cameras.
+the hypotheses of the minimal solvers, and measures whether the best one can be chance. Hypotheses come from three
+matches of levelled cameras, from two with parallel walls, from five if gravity is unknown, and by estimated depth
+(`proposals`).
 
 Source: M. Fischler, R. Bolles, Random Sample Consensus, CACM 1981; O. Chum, J. Matas, O. Obdrzalek, Enhancing RANSAC
 by generalized model optimization, ACCV 2004; P. Torr, A. Zisserman, MLESAC, CVIU 2000.
@@ -24,7 +25,7 @@ from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
-from pansplat.poses.proposals import Pose, propose_by_depth
+from pansplat.poses.proposals import propose_by_depth
 from pansplat.poses.solvers import (
     Bearings,
     Rotation,
@@ -41,7 +42,6 @@ from pansplat.poses.solvers import (
     skew,
     two_view_depths,
     upright_from_three,
-    upright_from_two,
 )
 
 # Limits are chosen on the 78 pairs of zind, and numbers of samples on tours of generated homes (docs/poses.md).
@@ -70,7 +70,6 @@ _MIN_PARALLAX = 5.0  # least parallax of two places, in standard deviations of t
 _MAX_UNCERTAINTY = math.radians(4)  # largest standard deviation of the direction
 # Hypotheses are optimised with the noise enlarged by each factor in turn: of samples, with parallel walls, by depth.
 _FACTORS, _PARALLEL_FACTORS, _DEPTH_FACTORS = (2, 1), (4, 2, 1), (24, 6, 2, 1)
-_EQUAL_SCORE = 0.9  # a lower score may win by parallel walls, because matches on one object share an error
 _SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # equal hypotheses differ by less
 _SAME_ESSENTIAL = 0.998  # cosine of two essential matrices as vectors, above which they are equal (3.6 degrees)
 _COMPARED_ESSENTIALS = 2000  # best essential matrices among which different ones are sought
@@ -343,42 +342,48 @@ def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> tuple[l
     """Distinct hypotheses that are optimised over the matches, best first, and those of a comparison as proposed."""
     if len(evidence.a) < _MIN_MATCHES:
         return [], []
-    free, parallel = _sample_essentials(evidence, rng)
-    found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
-    agreed, alike = _propose_by_depth(evidence, rng)
-    directions = [(rotation, t / max(float(np.linalg.norm(t)), 1e-9)) for rotation, t in (*agreed, *alike)]
-    found += [_optimise(skew(unit) @ rotation, evidence, _DEPTH_FACTORS) for rotation, unit in directions]
-    if len(parallel):  # inexact: compared among themselves, with a larger tolerance
-        chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
+    chosen = _choose_best(_sample_essentials(evidence, rng), evidence, _KEPT)
+    found = [_optimise(essential, evidence, _FACTORS) for essential in chosen]
+    if evidence.axes.has_walls:  # inexact: compared among themselves, with a larger tolerance
+        chosen = _choose_best(_sample_parallel(evidence, rng), evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
-    proposed = [
-        evidence.evaluate(rotation, unit, float(np.linalg.norm(t)))
-        for (rotation, t), (_, unit) in zip(alike, directions[len(agreed) :], strict=True)
-    ]
-    return _merge_same(found, evidence.axes), proposed
+    proposed = []
+    if evidence.depths is not None and evidence.surroundings is not None:
+        matches = evidence.a, evidence.b, evidence.prior, evidence.depths
+        for rotation, translation in propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.links):
+            distance = float(np.linalg.norm(translation))
+            unit = translation / max(distance, 1e-9)
+            found.append(_optimise(skew(unit) @ rotation, evidence, _DEPTH_FACTORS))
+            proposed.append(evidence.evaluate(rotation, unit, distance))
+    return _merge_same(found), proposed
 
 
-def _sample_essentials(
-    evidence: _Evidence, rng: np.random.Generator
-) -> tuple[Float[Array, "n 3 3"], Float[Array, "m 3 3"]]:
-    """Essential matrices of random samples: of any pose or of levelled cameras, and of cameras with parallel walls."""
+def _sample_essentials(evidence: _Evidence, rng: np.random.Generator) -> Float[Array, "n 3 3"]:
+    """Essential matrices of random samples of levelled cameras, and of cameras in any pose if gravity is unknown."""
     a, b, axes = evidence.a, evidence.b, evidence.axes
     levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
-    free, parallel = [], [np.empty((0, 3, 3))]
+    found = []
     for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
-        chosen = _draw(rng, top, _SAMPLES[5], 5)
-        free.append(essential_from_five(a[chosen], b[chosen])[0])
-        for size, solver in ((3, upright_from_three), (2, upright_from_two)):
-            chosen = _draw(rng, top, _SAMPLES[size], size)
-            rotations, translations = solver(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
-            free.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
-        for rotation in axes.wall_rotations:
+        chosen = _draw(rng, top, _SAMPLES[3], 3)
+        rotations, translations = upright_from_three(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
+        found.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
+        if not axes.has_down:
+            chosen = _draw(rng, top, _SAMPLES[5], 5)
+            found.append(essential_from_five(a[chosen], b[chosen])[0])
+    return np.concatenate(found)
+
+
+def _sample_parallel(evidence: _Evidence, rng: np.random.Generator) -> Float[Array, "n 3 3"]:
+    """Essential matrices of random samples of cameras with parallel walls."""
+    a, b, found = evidence.a, evidence.b, []
+    for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
+        for rotation in evidence.axes.wall_rotations:
             chosen = _draw(rng, top, _SAMPLES[2], 2)
             normals = cross(a[chosen] @ rotation.T, b[chosen])
             translations = cross(normals[:, 0], normals[:, 1])
             translations /= np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-12)
-            parallel.append(skew(translations) @ rotation)
-    return np.concatenate(free), np.concatenate(parallel)
+            found.append(skew(translations) @ rotation)
+    return np.concatenate(found)
 
 
 def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int) -> Float[Array, "kept 3 3"]:
@@ -386,14 +391,6 @@ def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: i
     quick = _score_essentials(essential, evidence.strongest(_QUICK))
     essential = essential[np.argsort(-quick, kind="stable")[:_RESCORED]]
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
-
-
-def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> tuple[list[Pose], list[Pose]]:
-    """Poses by the estimated depths: of many matches, and of a comparison; none without depths."""
-    if evidence.depths is None or evidence.surroundings is None:
-        return [], []
-    matches = evidence.a, evidence.b, evidence.prior, evidence.depths
-    return propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.links, rng)
 
 
 def _sample_depths(
@@ -418,23 +415,13 @@ def _optimise(essential: Float[Array, "3 3"], evidence: _Evidence, factors: Sequ
     return best
 
 
-def _merge_same(found: Sequence[Hypothesis], axes: RotationPrior) -> list[Hypothesis]:
-    """One hypothesis of each group of equal ones, best first.
-
-    It is the one of the highest score, or one of nearly this score that makes the walls parallel.
-    """
+def _merge_same(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The hypothesis of the highest score of each group of equal ones, best first."""
     distinct: list[Hypothesis] = []
     for hypothesis in sorted(found, key=lambda h: -h.score):
-        same = next((n for n, other in enumerate(distinct) if _are_same(hypothesis, other)), None)
-        if same is None:
+        if not any(_are_same(hypothesis, other) for other in distinct):
             distinct.append(hypothesis)
-        elif (
-            hypothesis.score > _EQUAL_SCORE * distinct[same].score
-            and axes.confirms(hypothesis.rotation)
-            and not axes.confirms(distinct[same].rotation)
-        ):
-            distinct[same] = hypothesis
-    return sorted(distinct, key=lambda h: -h.score)
+    return distinct
 
 
 def _are_same(first: Hypothesis, second: Hypothesis) -> bool:
