@@ -27,17 +27,17 @@ from pansplat.system.components import label_components
 
 IndexPair = tuple[int, int]
 
-_LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
-_LARGEST_GAP = 0.15  # of the translations around it, relative to their length
-_JOINED_ODDS = 1.0  # logarithm of the odds of a junction of two groups
+_LARGEST_LOOP = math.radians(4)  # right pairs of a triangle turn by less around it
+_LARGEST_GAP = 0.15  # and their translations leave a smaller gap, relative to their length
+_JOINED_ODDS = 1.0  # groups are joined above this logarithm of the odds
 _AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if they are wrong; neighbours look alike
-_LEAST_ODDS = -9.0  # of a hypothesis
-_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; gaps in camera heights, and relative
-_RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other
-_AGREEING_PLACES = 0.2  # distance of two places of a panorama that confirm each other, relative to its own distance
-_OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
-_FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
-_ROUNDS = 3  # of adjustment and removal of outliers
+_LEAST_ODDS = -9.0  # hypotheses with a lower logarithm of the odds are left out
+_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # agreeing hypotheses are nearer: camera heights, or relative
+_RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # junctions that differ by more exclude each other
+_AGREEING_PLACES = 0.2  # places of a panorama that confirm each other are nearer, relative to its own distance
+_OUTLIER = 8.0  # an observation with a larger residual is left out, in the noise's standard deviation
+_FEW_JOINT = 40  # with fewer points that three panoramas see, estimated distances count in the adjustment
+_ROUNDS = 3  # the poses are adjusted so often, each time without the outliers
 _NONE_SHOWS_IT = "no other photograph shows this room{}: take one in the doorway"
 _REASONS = {  # by the problem of the best pair, without its figures
     "": "it seems to be at another place than other photographs state: take one more near it",
@@ -242,16 +242,23 @@ def _place_group(
     downs: Float[Array, "view 3"],
     noise: float,
 ) -> Group:
-    growing = _GrowingGroup(_make_tracks(features, relations), relations, downs, noise)
-    growing.grow()
-    bundle, placed = growing.with_distances(), growing.placed
+    """The group that relations connect: placed by the strongest ones, then adjusted together."""
+    start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
+    poses = {start[0]: np.eye(4)}
+    while leaving := [pair for pair in relations if (pair[0] in poses) != (pair[1] in poses)]:
+        i, j = max(leaving, key=lambda pair: relations[pair].score)
+        if i in poses:
+            poses[j] = poses[i] @ np.linalg.inv(relations[i, j].motion)
+        else:
+            poses[i] = poses[j] @ relations[i, j].motion
+    placed = tuple(sorted(poses))
+    bundle = _make_bundle(_make_tracks(features, relations), placed, np.stack([poses[v] for v in placed]), downs)
+    bundle = _add_distances(bundle, placed, relations)
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
             bundle = adjust(bundle, noise)
         bundle = bundle.select(residual_angles(bundle) < _OUTLIER * noise)
-    order = np.argsort(placed)
-    poses = make_motion(bundle.rotations, bundle.centres)[order]
-    return Group(tuple(int(placed[i]) for i in order), poses, point_depths(bundle), residual_angles(bundle))
+    return Group(placed, make_motion(bundle.rotations, bundle.centres), point_depths(bundle), residual_angles(bundle))
 
 
 def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None, str]:
@@ -319,86 +326,36 @@ def _make_tracks(features: Sequence[Features], relations: Mapping[IndexPair, Rel
     return _Observations(view, track, bearings)
 
 
-class _GrowingGroup:
-    """Panoramas that are placed one after another; the first one is the world.
+def _make_bundle(
+    observations: _Observations,
+    placed: Sequence[int],
+    poses: Float[Array, "placed 4 4"],
+    downs: Float[Array, "view 3"],
+) -> Bundle:
+    """The placed panoramas, and the points that two or more of them see."""
+    position = np.full(len(downs), -1)
+    position[list(placed)] = np.arange(len(placed))
+    kept = position[observations.view] >= 0
+    counts = np.bincount(observations.track[kept], minlength=int(observations.track.max(initial=0)) + 1)
+    kept &= counts[observations.track] >= 2
+    tracks, point = np.unique(observations.track[kept], return_inverse=True)
+    point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
+    rotation, centre, down = poses[:, :3, :3], poses[:, :3, 3], downs[list(placed)]
+    points = triangulate(rotation, centre, camera, point, bearing, len(tracks))
+    world = np.einsum("nij,nj->ni", rotation, down)
+    known = np.isfinite(world).all(axis=1)
+    mean = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
+    return Bundle(rotation, centre, points, camera, point, bearing, down, mean / np.linalg.norm(mean))
 
-    Attributes:
-        placed: panoramas in the order of placing; cameras of the bundle.
-        bundle: their poses, and the points that two or more of them see.
+
+def _add_distances(bundle: Bundle, placed: Sequence[int], relations: Mapping[IndexPair, RelativePose]) -> Bundle:
+    """The bundle with estimated distances for panoramas that few points connect to two others.
+
+    Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
     """
-
-    def __init__(
-        self,
-        observations: _Observations,
-        relations: Mapping[IndexPair, RelativePose],
-        downs: Float[Array, "view 3"],
-        noise: float,
-    ) -> None:
-        self._observations, self._relations, self._downs, self._noise = observations, relations, downs, noise
-        start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
-        self.placed = [start[0]]
-        self._triangulate(np.eye(4)[None])
-        self._add(start[1])
-
-    def grow(self) -> None:
-        """Place all panoramas."""
-        while True:
-            candidates: dict[int, float] = {}
-            for (i, j), relation in self._relations.items():
-                for inside, outside in ((i, j), (j, i)):
-                    if inside in self.placed and outside not in self.placed:
-                        candidates[outside] = candidates.get(outside, 0.0) + relation.score
-            if not candidates:
-                return
-            self._add(max(candidates, key=lambda v: candidates[v]))
-            self.bundle = adjust(self.bundle, self._noise, steps=6)
-
-    def with_distances(self) -> Bundle:
-        """The bundle with estimated distances for panoramas that few points connect to two others.
-
-        Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
-        """
-        bundle, placed = self.bundle, self.placed
-        counts = np.bincount(bundle.point)
-        joint = np.bincount(bundle.camera[counts[bundle.point] > 2], minlength=len(placed))
-        weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
-        pairs = [pair for pair in self._relations if weak & set(pair)]
-        numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
-        return replace(bundle, pairs=numbers, distances=np.array([self._relations[pair].distance for pair in pairs]))
-
-    def _add(self, view: int) -> None:
-        """Place a panorama where its relations to placed ones do, the strongest of those that agree most."""
-        poses = make_motion(self.bundle.rotations, self.bundle.centres)
-        places = []
-        for other, pose in zip(self.placed, poses, strict=True):
-            motion = _motion_between(self._relations, view, other)
-            if motion is not None:
-                places.append((pose @ motion, self._relations[min(view, other), max(view, other)]))
-        support = [
-            sum(
-                other.score
-                for place, other in places
-                if np.linalg.norm((place - own)[:3, 3]) < _AGREEING_PLACES * (relation.distance + other.distance) / 2
-            )
-            for own, relation in places
-        ]
-        self.placed.append(view)
-        self._triangulate(np.concatenate((poses, places[int(np.argmax(support))][0][None])))
-
-    def _triangulate(self, poses: Float[Array, "view 4 4"]) -> None:
-        """Make the bundle of the placed panoramas at these poses."""
-        observations = self._observations
-        position = np.full(len(self._downs), -1)
-        position[self.placed] = np.arange(len(self.placed))
-        kept = position[observations.view] >= 0
-        counts = np.bincount(observations.track[kept], minlength=int(observations.track.max(initial=0)) + 1)
-        kept &= counts[observations.track] >= 2
-        tracks, point = np.unique(observations.track[kept], return_inverse=True)
-        point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
-        rotation, centre = poses[:, :3, :3], poses[:, :3, 3]
-        points = triangulate(rotation, centre, camera, point, bearing, len(tracks))
-        downs = self._downs[self.placed]
-        world = np.einsum("nij,nj->ni", rotation, downs)
-        known = np.isfinite(world).all(axis=1)
-        down = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
-        self.bundle = Bundle(rotation, centre, points, camera, point, bearing, downs, down / np.linalg.norm(down))
+    counts = np.bincount(bundle.point)
+    joint = np.bincount(bundle.camera[counts[bundle.point] > 2], minlength=len(placed))
+    weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
+    pairs = [pair for pair in relations if weak & set(pair)]
+    numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
+    return replace(bundle, pairs=numbers, distances=np.array([relations[pair].distance for pair in pairs]))
