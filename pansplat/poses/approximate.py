@@ -15,8 +15,8 @@ import numpy as np
 
 from pansplat.poses.placing import Guess, Piece, PlanPose, list_through_door
 
-_LEAST_PROBABILITY = 0.5
-_SAME, _TURN = 1.0, 0.3  # distance of places that support each other, camera heights, and turn, radians
+_LEAST_PROBABILITY = 0.5  # a place that is less probable is not stated
+_SAME, _TURN = 1.0, 0.3  # places that support each other are nearer: camera heights, and turn, radians
 
 
 class LinkedPlace(NamedTuple):

@@ -539,7 +539,7 @@ def _relate_views(
         key = hash_parts(first.key, second.key, str(links[pair]))
         return cache.get("pair", key, lambda: relate(pair))
 
-    groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
+    groups, counts = list(range(len(views))), [0] * len(views)  # what certain pairs connect; certain pairs of each view
 
     def is_needed(pair: IndexPair) -> bool:
         i, j = pair

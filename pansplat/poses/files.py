@@ -28,7 +28,7 @@ from pansplat.system.files import require_replaceable
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 
-_KIND = "poses"  # of entries of the store
+_KIND = "poses"  # what the store calls estimated poses
 
 
 def require_mergeable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:

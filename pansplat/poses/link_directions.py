@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-_NOISE, _RIGHT = math.radians(15), 0.85  # of a link, which is often on a door; share of right links
+_NOISE, _RIGHT = math.radians(15), 0.85  # deviation of a link, which is often on a door; share of right links
 
 
 class LinkDirections(NamedTuple):

@@ -170,7 +170,7 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     descriptors = rng.uniform(size=(400, 128)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     every = Features(bearings, descriptors, np.ones(400), np.full(400, 1e-3))
-    learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3), 0.01)
+    learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3))
     found = Matches(np.array(((2, 1), (0, 2))), np.array((0.99, 0.4)))
     monkeypatch.setattr("pansplat.poses.estimate.match_learned", lambda matcher, first, second: found)
     few, many = (_view(every.strongest(count), np.zeros((64, 128), np.float32), learned) for count in (20, 400))
