@@ -1,10 +1,9 @@
 """Poses of many panoramas from the relative poses of their pairs.
 
 Each relation states a rotation, a direction and, by the estimated depths, a distance in camera heights. Relations that
-contradict the others around triangles are left out. The others connect the panoramas in groups. A group grows from its
-best pair: the panorama with the strongest relations to the placed ones is added where most of them place it, and all
-poses are adjusted together. Groups and single panoramas are then joined where the hypotheses of several pairs between
-them agree, or one is probable enough by itself.
+contradict the others around triangles are left out. The others connect the panoramas in groups. The strongest relations
+place a group, and all its poses are adjusted together. Groups and single panoramas are then joined where the
+hypotheses of several pairs between them agree, or one is probable enough by itself.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from pansplat.poses.bundle import Bundle, adjust, point_depths, residual_angles, triangulate
@@ -34,7 +33,6 @@ _AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if t
 _LEAST_ODDS = -9.0  # hypotheses with a lower logarithm of the odds are left out
 _JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # agreeing hypotheses are nearer: camera heights, or relative
 _RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # junctions that differ by more exclude each other
-_AGREEING_PLACES = 0.2  # places of a panorama that confirm each other are nearer, relative to its own distance
 _OUTLIER = 8.0  # an observation with a larger residual is left out, in the noise's standard deviation
 _FEW_JOINT = 40  # with fewer points that three panoramas see, estimated distances count in the adjustment
 _ROUNDS = 3  # the poses are adjusted so often, each time without the outliers
@@ -113,11 +111,11 @@ def _place_groups(
     features: Sequence[Features], relations: Mapping[IndexPair, RelativePose], downs: Array, noise: float
 ) -> list[Group]:
     """The groups of panoramas that relations connect."""
-    groups = []
-    for members in _connect(len(features), relations):
-        own = {pair: relation for pair, relation in relations.items() if pair[0] in members}
-        groups.append(_place_group(features, own, downs, noise))
-    return groups
+    parts: dict[int, dict[IndexPair, RelativePose]] = {}
+    labels = label_components(len(features), relations)
+    for pair, relation in relations.items():
+        parts.setdefault(labels[pair[0]], {})[pair] = relation
+    return [_place_group(features, parts[label], downs, noise) for label in sorted(parts)]
 
 
 _Part = dict[int, Float[Array, "4 4"]]
@@ -228,23 +226,14 @@ def _closes(kept: Mapping[IndexPair, RelativePose], relation: RelativePose, pair
     return turn < _LARGEST_LOOP and float(np.linalg.norm(around[:3, 3] - own[:3, 3])) < _LARGEST_GAP * length
 
 
-def _connect(count: int, relations: Mapping[IndexPair, RelativePose]) -> list[set[int]]:
-    """The sets of two or more panoramas that relations connect."""
-    sets: dict[int, set[int]] = {}
-    for view, label in enumerate(label_components(count, relations)):
-        sets.setdefault(label, set()).add(view)
-    return [members for members in sets.values() if len(members) > 1]
-
-
 def _place_group(
     features: Sequence[Features],
     relations: Mapping[IndexPair, RelativePose],
     downs: Float[Array, "view 3"],
     noise: float,
 ) -> Group:
-    """The group that relations connect: placed by the strongest ones, then adjusted together."""
-    start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
-    poses = {start[0]: np.eye(4)}
+    """The group that relations connect: placed by a tree of the strongest ones, then adjusted together."""
+    poses = {min(relations)[0]: np.eye(4)}
     while leaving := [pair for pair in relations if (pair[0] in poses) != (pair[1] in poses)]:
         i, j = max(leaving, key=lambda pair: relations[pair].score)
         if i in poses:
@@ -252,8 +241,7 @@ def _place_group(
         else:
             poses[i] = poses[j] @ relations[i, j].motion
     placed = tuple(sorted(poses))
-    bundle = _make_bundle(_make_tracks(features, relations), placed, np.stack([poses[v] for v in placed]), downs)
-    bundle = _add_distances(bundle, placed, relations)
+    bundle = _make_bundle(features, relations, placed, np.stack([poses[view] for view in placed]), downs)
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
             bundle = adjust(bundle, noise)
@@ -298,64 +286,40 @@ def _motion_between(known: Mapping[IndexPair, RelativePose], i: int, j: int) -> 
     return np.linalg.inv(known[j, i].motion) if (j, i) in known else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Observations:
-    """Observations of tracks: panorama, track and bearing; at most one for each panorama and track."""
+def _make_bundle(
+    features: Sequence[Features],
+    relations: Mapping[IndexPair, RelativePose],
+    placed: Sequence[int],
+    poses: Float[Array, "placed 4 4"],
+    downs: Float[Array, "view 3"],
+) -> Bundle:
+    """The placed panoramas, and a point for the features that matches connect, of at most one in each panorama.
 
-    view: Int[Array, "observation"]
-    track: Int[Array, "observation"]
-    bearing: Float[Array, "observation 3"]
-
-
-def _make_tracks(features: Sequence[Features], relations: Mapping[IndexPair, RelativePose]) -> _Observations:
-    """Features that matches connect; tracks with two features of one panorama are dropped."""
+    Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
+    Relations of a panorama that few such points connect therefore state distances.
+    """
     starts = np.concatenate(((0,), np.cumsum([len(f) for f in features])))
     edges = np.concatenate([relation.indices + starts[[i, j]] for (i, j), relation in relations.items()])
     size = int(starts[-1])
     graph = scipy.sparse.coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(size, size))
     labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     nodes = np.unique(edges)
-    view = np.searchsorted(starts, nodes, side="right") - 1
-    track = np.unique(labels[nodes], return_inverse=True)[1].reshape(-1)
-    _, index, repeats = np.unique(np.stack((track, view)), axis=1, return_inverse=True, return_counts=True)
-    ambiguous = np.zeros(track.max() + 1, bool)
-    ambiguous[track[repeats[index.reshape(-1)] > 1]] = True
-    kept = ~ambiguous[track]
-    nodes, view, track = nodes[kept], view[kept], track[kept]
-    bearings = np.concatenate([f.bearings for f in features])[nodes]
-    return _Observations(view, track, bearings)
-
-
-def _make_bundle(
-    observations: _Observations,
-    placed: Sequence[int],
-    poses: Float[Array, "placed 4 4"],
-    downs: Float[Array, "view 3"],
-) -> Bundle:
-    """The placed panoramas, and the points that two or more of them see."""
-    position = np.full(len(downs), -1)
-    position[list(placed)] = np.arange(len(placed))
-    kept = position[observations.view] >= 0
-    counts = np.bincount(observations.track[kept], minlength=int(observations.track.max(initial=0)) + 1)
-    kept &= counts[observations.track] >= 2
-    tracks, point = np.unique(observations.track[kept], return_inverse=True)
-    point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
+    camera = np.searchsorted(placed, np.searchsorted(starts, nodes, side="right") - 1)
+    point = np.unique(labels[nodes], return_inverse=True)[1].reshape(-1)
+    _, index, repeats = np.unique(np.stack((point, camera)), axis=1, return_inverse=True, return_counts=True)
+    kept = ~np.isin(point, point[repeats[index.reshape(-1)] > 1])
+    camera, point = camera[kept], np.unique(point[kept], return_inverse=True)[1].reshape(-1)
+    bearing = np.concatenate([f.bearings for f in features])[nodes[kept]]
     rotation, centre, down = poses[:, :3, :3], poses[:, :3, 3], downs[list(placed)]
-    points = triangulate(rotation, centre, camera, point, bearing, len(tracks))
+    counts = np.bincount(point)
+    points = triangulate(rotation, centre, camera, point, bearing, len(counts))
     world = np.einsum("nij,nj->ni", rotation, down)
     known = np.isfinite(world).all(axis=1)
     mean = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
-    return Bundle(rotation, centre, points, camera, point, bearing, down, mean / np.linalg.norm(mean))
-
-
-def _add_distances(bundle: Bundle, placed: Sequence[int], relations: Mapping[IndexPair, RelativePose]) -> Bundle:
-    """The bundle with estimated distances for panoramas that few points connect to two others.
-
-    Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
-    """
-    counts = np.bincount(bundle.point)
-    joint = np.bincount(bundle.camera[counts[bundle.point] > 2], minlength=len(placed))
+    joint = np.bincount(camera[counts[point] > 2], minlength=len(placed))
     weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
     pairs = [pair for pair in relations if weak & set(pair)]
     numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
-    return replace(bundle, pairs=numbers, distances=np.array([relations[pair].distance for pair in pairs]))
+    distances = np.array([relations[pair].distance for pair in pairs])
+    mean /= np.linalg.norm(mean)
+    return Bundle(rotation, centre, points, camera, point, bearing, down, mean, numbers, distances)
