@@ -31,12 +31,12 @@ class Bundle:
     """Cameras, points and observations.
 
     Attributes:
-        rotations, centres: of the cameras, camera to world.
+        rotations, centres: poses of the cameras, camera to world.
         points: homogeneous unit vectors in the world.
         camera, point: indices for each observation.
         bearings: observed unit directions in the camera's frame.
         downs: for each camera the down direction in its frame; NaN where it is unknown.
-        down: in the world.
+        down: the down direction of the world.
         pairs, distances: cameras whose distance is known independently of the points.
     """
 

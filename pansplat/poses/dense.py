@@ -67,7 +67,7 @@ class Surroundings:
 
     Attributes:
         image: RGB in [0, 1], as the camera took it.
-        depth: of the same panorama.
+        depth: estimated depth of the panorama.
     """
 
     image: Float[Array, "h 2*h 3"]

@@ -31,7 +31,7 @@ class DepthMap:
     """Estimated depth of a panorama.
 
     Attributes:
-        log_depth: in camera heights, of the upright panorama.
+        log_depth: logarithm of the depth of the upright panorama, camera heights.
         scale: Laplace scale of it, at any size.
         rotation: the upright camera's axes in the camera's frame, as columns.
     """
@@ -82,7 +82,7 @@ class MatchDepths:
     """Estimated depth at matches, in both panoramas.
 
     Attributes:
-        log_depth, deviation: of the first and of the second panorama.
+        log_depth, deviation: log-depth and its deviation in the first and in the second panorama.
     """
 
     log_depth: Float[Array, "match 2"]
@@ -97,7 +97,7 @@ class MatchDepths:
 
         Args:
             depths: triangulated, in units of the distance; positive where `weight` is.
-            weight: of each match.
+            weight: weight of each match.
         """
         used = weight > 1e-3
         if not used.any():
@@ -126,9 +126,9 @@ class MatchDepths:
 
         Args:
             depths: triangulated, in units of the distance.
-            distance: of the cameras, camera heights.
-            parallax: of each match, radians.
-            noise: of the triangulation's bearings, radians.
+            distance: distance of the cameras, camera heights.
+            parallax: parallax of each match, radians.
+            noise: standard deviation of the bearings, radians.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.log(depths * distance) - self.log_depth

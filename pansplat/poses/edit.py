@@ -61,7 +61,7 @@ class PoseEditor:
         """Nothing is written before the first change.
 
         Args:
-            folder: of the tour.
+            folder: the folder of the tour.
             panoramas: all of it, as they were loaded.
         """
         self.file = folder / POSES
@@ -109,7 +109,7 @@ class PoseEditor:
 
         Args:
             poses: cam2world of each, metres.
-            world: of the file, whose other panoramas they are placed beside; None for one of their own.
+            world: number of the world whose panoramas they are placed beside; None for one of their own.
             unit: metres that are a camera height, of a new world.
         """
         content = self.read()
@@ -174,8 +174,8 @@ def merge_estimate(
 
     Args:
         file: the poses.json.
-        estimate: of panoramas.
-        names: of the files in it.
+        estimate: the new poses.
+        names: the name of each of its files in the poses.json.
         overwrite: whether all poses are replaced that the estimate has.
     """
     content = read_pose_content(file)

@@ -117,10 +117,10 @@ class PoseEstimate:
 
     Attributes:
         images: the files that were read.
-        groups: of panoramas that reliable pairs connect, the largest one first; each has a world of its own.
+        groups: panoramas that reliable pairs connect, the largest group first; each has a world of its own.
         unplaced: the reason for each file without a pose.
-        relations: of the pairs that were compared.
-        names: of the files, for messages; by default their own.
+        relations: relative poses of the pairs that were compared.
+        names: what messages call the files; by default their own names.
         approximate: about where files without a pose are, by links.
     """
 
@@ -175,9 +175,9 @@ class _View:
     """What is used of a panorama.
 
     Attributes:
-        features: by SIFT, of faces along the camera's axes.
+        features: SIFT on faces along the camera's axes.
         turned: the same, of faces turned against the walls.
-        learned: by the learned matcher.
+        learned: features of the learned matcher.
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
@@ -235,7 +235,7 @@ def estimate_poses(
         images: files, 2:1; one that is repeated is used once.
         masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
         links: for an image, the yaw at which a tour links to other images, radians to the right of the centre.
-        names: of the images, for messages; by default those of the files.
+        names: what messages call the images; by default the names of the files.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
         cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
@@ -471,7 +471,7 @@ class _SceneMask:
     """Where panoramas show the scene and not what is fixed to the camera.
 
     Attributes:
-        hashes: of the grey panoramas.
+        hashes: hashes of the grey panoramas.
         bits: the mask, packed.
     """
 
@@ -609,7 +609,7 @@ def _is_mirrored(
 
     Args:
         overlap: `_quick_overlap` of both, if known.
-        relation: of both; the mirror image must fit better.
+        relation: relative pose of both; the mirror image must fit better.
     """
     mirrored = first.mirrored
     evidence = _quick_overlap(mirrored.features, second.features)

@@ -90,7 +90,7 @@ class Matches:
     """Pairs of features, the most probable first.
 
     Attributes:
-        indices: of the features in the first and in the second panorama.
+        indices: numbers of the features in the first and in the second panorama.
         prior: probability of each match to be right, before any pose is known.
     """
 

@@ -120,10 +120,10 @@ def estimate_pairs(
     read.
 
     Args:
-        folder: of the tour.
+        folder: the folder of the tour.
         panoramas: two or more, of unique names.
         near, far: metres; they override the estimated range.
-        camera_height: of the cameras over the floor, metres.
+        camera_height: height of the cameras over the floor, metres.
         on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
             panorama.
     """

@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -132,34 +131,28 @@ def detect_learned(
 
 
 def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> Matches:
-    """Matches of two panoramas, whose prior is the probability that each is right."""
+    """Matches of two panoramas, whose prior is the probability that each is right.
+
+    A match that contradicts or repeats a more probable one is left out.
+    """
     common, device = count_common(first, second), next(matcher.parameters()).device
     order = np.argsort(-common, axis=None, kind="stable")[:_FACE_PAIRS]
-    found = []
+    indices, priors = [np.empty((0, 2), np.int64)], [np.empty(0)]
+    constant, by_score, by_support = _CALIBRATION
     for i, j in np.stack(np.unravel_index(order, common.shape), axis=1).tolist():
         with torch.inference_mode():
             faces = (tuple(each.to(device) for each in face) for face in (first.face(i), second.face(j)))
-            indices, scores = (each.cpu() for each in matcher.lightglue(*faces))
-        found.append((indices.numpy() + np.array((first.starts[i], second.starts[j])), scores.double().numpy()))
-    return _join_faces(first, second, found)
-
-
-def _join_faces(
-    first: LearnedFeatures, second: LearnedFeatures, found: Sequence[tuple[Int[Array, "_ 2"], Float[Array, "_"]]]
-) -> Matches:
-    """The matches of all pairs of faces, without those that contradict or repeat a more probable one."""
-    indices = np.concatenate([index for index, _ in found])
-    score = np.concatenate([score for _, score in found])
-    support = np.concatenate([np.full(len(score), score[score > _CONFIDENT].sum()) for _, score in found])
-    constant, by_score, by_support = _CALIBRATION
-    clipped = score.clip(_MIN_SCORE, _MAX_SCORE)
-    odds = constant + by_score * np.log(clipped / (1 - clipped)) + by_support * np.log1p(support)
-    probability = 1 / (1 + np.exp(-odds))
-    order = np.argsort(-probability, kind="stable")
-    order = order[score[order] > _MIN_SCORE]
-    a, b = first.bearings[indices[order, 0]], second.bearings[indices[order, 1]]
+            index, score = (each.cpu().double().numpy() for each in matcher.lightglue(*faces))
+        kept, clipped = score > _MIN_SCORE, score.clip(_MIN_SCORE, _MAX_SCORE)
+        support = math.log1p(float(score[score > _CONFIDENT].sum()))
+        odds = constant + by_score * np.log(clipped / (1 - clipped)) + by_support * support
+        indices.append((index[kept] + (first.starts[i], second.starts[j])).astype(np.int64))
+        priors.append(1 / (1 + np.exp(-odds[kept])))
+    index, prior = np.concatenate(indices), np.concatenate(priors)
+    order = np.argsort(-prior, kind="stable")
+    a, b = first.bearings[index[order, 0]], second.bearings[index[order, 1]]
     order = order[are_distinct(a) & are_distinct(b)]
-    return Matches(indices[order], probability[order])
+    return Matches(index[order], prior[order])
 
 
 def count_common(first: LearnedFeatures, second: LearnedFeatures) -> Int[Array, "face face"]:

@@ -16,8 +16,8 @@ class LinkDirections(NamedTuple):
     """Where a tour's links place the other panorama: yaw to the right of the centre column, radians; None without one.
 
     Attributes:
-        there: from the first panorama.
-        back: from the second panorama.
+        there: yaw of the link of the first panorama.
+        back: yaw of the link of the second panorama.
     """
 
     there: float | None = None

@@ -49,7 +49,7 @@ def propose_by_depth(
         depths: estimated at the matches.
         axes: gravity and walls of both panoramas; without walls there is no hypothesis.
         surroundings: all that both panoramas show.
-        links: from each panorama towards the other one.
+        links: directions of each panorama towards the other one.
     """
     if not axes.has_walls:
         return []

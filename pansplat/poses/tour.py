@@ -87,8 +87,8 @@ def build_tour(
     """Poses of all panoramas that reliable pairs connect.
 
     Args:
-        features: of all panoramas.
-        relations: of the pairs (i, j), i < j, that were compared.
+        features: features of all panoramas.
+        relations: relative poses of the pairs (i, j), i < j, that were compared.
         downs: gravity in each camera's frame; NaN where unknown.
         noise: standard deviation of a bearing, radians.
     """

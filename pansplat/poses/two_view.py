@@ -94,8 +94,8 @@ class Hypothesis:
 
     Attributes:
         score: natural logarithm of the likelihood ratio against chance.
-        probability: of each match to be right.
-        distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
+        probability: probability of each match to be right.
+        distance: camera heights between the cameras, by the estimated depths; NaN if they do not state it.
         is_proposed: whether it is the pose of a comparison of both panoramas, not optimised over matches.
     """
 
@@ -135,7 +135,7 @@ class _Evidence:
         axes: gravity and walls of both panoramas.
         depths: estimated at the matches, if they are known.
         surroundings: all that both panoramas show, with estimated depths.
-        links: from each panorama towards the other one, as a tour's links state them.
+        links: directions of each panorama towards the other one, as a tour's links state them.
     """
 
     a: Float[Array, "match 3"]
@@ -245,8 +245,8 @@ class _Linearised:
     """Epipolar angles of matches, radians, with their derivatives.
 
     Attributes:
-        by_pose: by the rotation vector (3) and the direction (2) of the pose.
-        by_first, by_second: by the bearings of the first and of the second panorama.
+        by_pose: derivatives by the rotation vector (3) and the direction (2) of the pose.
+        by_first, by_second: derivatives by the bearings of the first and of the second panorama.
     """
 
     angle: Float[Array, "n"]
@@ -493,7 +493,7 @@ class Hypotheses:
     """Relative poses of two panoramas, of which at most one is right: a row for each compared `Hypothesis`.
 
     Attributes:
-        motions: from the first camera's frame to the second one's, camera heights.
+        motions: motions from the first camera's frame to the second one's, camera heights.
         log_odds: logarithm of the odds of each against none.
     """
 
@@ -513,7 +513,7 @@ class RelativePose:
         parallax: 90 % quantile of the parallax of these matches, radians.
         uncertainty: standard deviations of rotation and direction by the noise of the matches, the distortion of the
             panoramas and the number of places, radians.
-        distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
+        distance: camera heights between the cameras, by the estimated depths; NaN if they do not state it.
         log_odds: logarithm of the odds that the pose is right, by matches and comparison; infinite if matches suffice.
         problem: why the pose must not be used; None if it passes the check.
         hypotheses: all that were compared, this pose among them.
@@ -571,11 +571,11 @@ def estimate_relative_pose(
 
     Args:
         first, second: features of both panoramas.
-        matches: between them.
+        matches: matches of these features.
         axes: gravity and walls of both panoramas.
         surroundings: all that both panoramas show, with estimated depths; without them only the matches count.
-        links: from each panorama towards the other one.
-        seed: of the random samples.
+        links: directions of each panorama towards the other one.
+        seed: seed of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
     indices = matches.indices[:count]

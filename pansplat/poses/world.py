@@ -139,7 +139,7 @@ def find_floor(
     Args:
         images: grey panoramas in [0, 1], of `FLOOR_HEIGHT`.
         poses: levelled, y down.
-        pairs: of panoramas that are compared.
+        pairs: panoramas that are compared.
     """
     reference = float(np.median([np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3]) for i, j in pairs]))
     low, high = (math.log(reference * bound) for bound in _RANGE)
