@@ -610,22 +610,18 @@ def estimate_relative_pose(
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
+    relation = replace(relation, indices=indices[right], parallax=spread, uncertainty=(math.inf, math.inf))
+    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
+        problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
+        return replace(relation, problem=problem, hypotheses=Hypotheses())
+    if log_odds < _DOUBTFUL_ODDS:
+        return relation
     used = np.flatnonzero(right)[:_MAX_POLISHED]
     rotation, translation, deviations = polish_pose(
         a[used], b[used], best.rotation, best.translation, evidence.noise[used], axes
     )
     uncertainty = _calibrate(deviations, places)
-    relation = replace(
-        relation,
-        rotation=rotation,
-        translation=translation,
-        indices=indices[right],
-        parallax=spread,
-        uncertainty=uncertainty,
-    )
-    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
-        problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
-        return replace(relation, problem=problem, hypotheses=Hypotheses())
+    relation = replace(relation, rotation=rotation, translation=translation, uncertainty=uncertainty)
     if relation.is_reliable and surroundings is not None and not math.isfinite(best.distance):
         return replace(relation, problem="the distance of the cameras cannot be determined")
     if relation.is_reliable and uncertainty[1] > _MAX_UNCERTAINTY:
