@@ -148,6 +148,6 @@ POSE = Suite(
         Column("s", "seconds", ".1f"),
     ),
     lambda row: row.get("suite"),
-    None,
+    lambda rows, header: None,
     summarise,
 )
