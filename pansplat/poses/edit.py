@@ -67,7 +67,7 @@ class PoseEditor:
         self.file = folder / POSES
         self._sources = {panorama.placement.source for panorama in panoramas} - {None}
         self._names = name_pictures(self.file, [panorama.image for panorama in panoramas])
-        self._by_name = {panorama.name: panorama.image for panorama in panoramas}
+        self._images = {panorama.name: panorama.image for panorama in panoramas}
         if not self._sources:
             raise InputError(f"{folder}: needed estimated poses or a {POSES} to change poses, got another format.")
         self._undo: list[tuple[bytes | None, bytes]] = []
@@ -97,8 +97,9 @@ class PoseEditor:
         if self.file.exists():
             return read_pose_content(self.file)
         (source,) = self._sources
-        names = {name: self._names[image] for name, image in self._by_name.items()}
-        return rename_panoramas(read_entry(source), names, {name: i.name for name, i in self._by_name.items()})
+        files = {name: image.name for name, image in self._images.items()}
+        names = {name: self._names[image] for name, image in self._images.items()}
+        return rename_panoramas(read_entry(source), names, files)
 
     def read_unit(self, world: int) -> float | None:
         """Metres that are one camera height of the estimated depths in a world, if the file states it."""

@@ -147,14 +147,6 @@ class _Evidence:
     surroundings: tuple[Surroundings, Surroundings] | None = None
     links: LinkDirections = NO_LINKS
 
-    def strongest(self, count: int) -> _Evidence:
-        """The evidence of the first `count` matches."""
-        first = slice(count)
-        depths = None if self.depths is None else self.depths.select(first)
-        return replace(
-            self, a=self.a[first], b=self.b[first], prior=self.prior[first], noise=self.noise[first], depths=depths
-        )
-
     def with_noise(self, factor: float) -> _Evidence:
         """The evidence with another noise, in units of this one."""
         return replace(self, noise=factor * self.noise)
@@ -195,10 +187,8 @@ class _Evidence:
             if not np.abs(step).max() < 0.5:
                 break
             found = self.evaluate(rotation, translation)
-            improved = found.score > best.score + 1e-3
-            if found.score > best.score:
-                best = found
-            if not improved:
+            before, best = best.score, max(best, found, key=lambda hypothesis: hypothesis.score)
+            if best.score <= before + 1e-3:
                 break
         return best
 
@@ -388,7 +378,7 @@ def _sample_parallel(evidence: _Evidence, rng: np.random.Generator) -> Float[Arr
 
 def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int) -> Float[Array, "kept 3 3"]:
     """At most `count` different essential matrices with the highest scores, best first."""
-    quick = _score_essentials(essential, evidence.strongest(_QUICK))
+    quick = _score_essentials(essential, evidence, _QUICK)
     essential = essential[np.argsort(-quick, kind="stable")[:_RESCORED]]
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
 
@@ -436,12 +426,15 @@ def _draw(rng: np.random.Generator, top: int, samples: int, size: int) -> Int[Ar
     return chosen + np.arange(size)
 
 
-def _score_essentials(essential: Float[Array, "n 3 3"], evidence: _Evidence) -> Float[Array, "n"]:
-    """Scores of essential matrices without the signs of the depths."""
-    a, b = (np.ascontiguousarray(rays.T, np.float32) for rays in (evidence.a, evidence.b))
-    gain = math.sqrt(2 / math.pi) * evidence.prior / (1 - evidence.prior) / evidence.noise
-    scores = _sum_gains(essential.astype(np.float32), a, b, evidence.noise.astype(np.float32), gain)
-    return scores + float(np.log1p(-evidence.prior).sum())
+def _score_essentials(
+    essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int | None = None
+) -> Float[Array, "n"]:
+    """Scores of essential matrices without the signs of the depths, by the first `count` matches."""
+    a, b = (np.ascontiguousarray(rays[:count].T, np.float32) for rays in (evidence.a, evidence.b))
+    prior, noise = evidence.prior[:count], evidence.noise[:count]
+    gain = math.sqrt(2 / math.pi) * prior / (1 - prior) / noise
+    scores = _sum_gains(essential.astype(np.float32), a, b, noise.astype(np.float32), gain)
+    return scores + float(np.log1p(-prior).sum())
 
 
 @compiled
