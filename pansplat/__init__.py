@@ -5,28 +5,24 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from pansplat.system.kernel_cache import choose_kernel_cache
-
-choose_kernel_cache(os.path.dirname(__file__), os.environ)
-
 # Threads of torch's operations sleep while they wait. By default they spin for milliseconds: beside another process, an
 # operation of half a millisecond on two threads takes six to nineteen.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 # Resolved at first use: `import pansplat` and `pansplat --help` must not import torch.
 _PUBLIC = {
     "Gaussians": "pansplat.gaussians.scene",
     "InputError": "pansplat.errors",
-    "Pair": "pansplat.inputs.pairs",
+    "PanoramaSet": "pansplat.inputs.panorama_sets",
     "Rendering": "pansplat.rendering",
     "Scene": "pansplat.gaussians.scene",
     "Views": "pansplat.inputs.views",
     "estimate_poses": "pansplat.poses.estimate",
     "load": "pansplat.pipeline",
     "load_model": "pansplat.pipeline",
-    "load_pairs": "pansplat.pipeline",
+    "load_sets": "pansplat.pipeline",
     "predict": "pansplat.pipeline",
     "predict_to_file": "pansplat.pipeline",
     "fuse": "pansplat.pipeline",

@@ -8,7 +8,7 @@ import torch
 
 from pansplat.gaussians.scene import Gains, Gaussians
 from pansplat.inputs.content import hash_context
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Views
 from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
@@ -37,8 +37,10 @@ class CachedPrediction:
     There is none of loaded panoramas, and without `PredictOptions.cache`.
     """
 
-    def __init__(self, source: Pair | Views, predictor: Predictor, options: PredictOptions, *, refined: bool) -> None:
-        self._pair = source if isinstance(source, Pair) and options.cache else None
+    def __init__(
+        self, source: PanoramaSet | Views, predictor: Predictor, options: PredictOptions, *, refined: bool
+    ) -> None:
+        self._pair = source if isinstance(source, PanoramaSet) and options.cache else None
         self._kind = "refinement" if refined else "prediction"
         code = refinement_fingerprint(RefineConfig(gaussians=options.gaussians)) if refined else ""
         self._settings = [predictor.fingerprint, code, *options.describe(refined=refined)]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from IPython.core.formatters import DisplayFormatter
 
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
     from pansplat.inputs.views import Views
     from pansplat.rendering import Rendering
 
@@ -48,7 +48,7 @@ def show(scene: Scene | str | Path, *, gaussians: int = DISPLAY_GAUSSIANS, heigh
     Args:
         scene: the scene, or its file.
         gaussians: largest number of Gaussians. In a notebook they are a part of its file, about 24 bytes each.
-        height: of the frame in a notebook, pixels.
+        height: rows of the frame in a notebook.
 
     Returns:
         The temporary page, without a notebook.
@@ -149,7 +149,7 @@ def _bundle_views(views: Views) -> _BUNDLE:
     return _bundle_pictures([image.permute(1, 2, 0).cpu().numpy() for image in views.images[:_MAX_PICTURES]])
 
 
-def _bundle_pair(pair: Pair) -> _BUNDLE:
+def _bundle_set(pair: PanoramaSet) -> _BUNDLE:
     """The context photographs; nothing if one cannot be read."""
     from pansplat.images.image_files import read_panorama
 
@@ -184,6 +184,6 @@ _DISPLAYS: tuple[tuple[str, str, Callable[[Any], _BUNDLE]], ...] = (
     ("pansplat.gaussians.scene", "Scene", _bundle_scene),
     ("pansplat.rendering.rasterize", "Rendering", _bundle_rendering),
     ("pansplat.inputs.views", "Views", _bundle_views),
-    ("pansplat.inputs.pairs", "Pair", _bundle_pair),
+    ("pansplat.inputs.panorama_sets", "PanoramaSet", _bundle_set),
 )
 """Module and name of each class that is displayed, and the function for it."""

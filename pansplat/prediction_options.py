@@ -25,7 +25,7 @@ Precision = Literal["float32", "bfloat16"]
 class ReadOptions:
     """How panoramas are read."""
 
-    # The names are those of the keywords of `pansplat.load_pairs`.
+    # The names are those of the keywords of `pansplat.load_sets`.
     convention: str | None = None
     """Pose convention; overrides that of the files: "cam2world opencv", "cam2world opengl",
     "world2cam opencv" or "world2cam opengl" (Habitat and Blender use opengl)."""

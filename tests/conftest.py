@@ -8,7 +8,7 @@ import os
 import re
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +20,7 @@ import torch
 from annotation_checks import restart_checks
 from hypothesis import HealthCheck, settings
 from jaxtyping import config, install_import_hook
-from PIL import Image
+from panorama_formats import write_posed
 from torch import Tensor
 
 # One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
@@ -229,22 +229,9 @@ class SpherePredictor:
         return make_balls(means, 6.4 / height, color=color, views=views.repeat_interleave(len(directions)))
 
 
-def _write_posed(folder: Path, pictures: dict[str, np.ndarray], places: Iterable[float], axis: int = 0) -> Path:
-    """Pictures (H 2H 3) of cameras on an axis, and their poses.json."""
-    folder.mkdir(parents=True, exist_ok=True)
-    poses = {}
-    for (name, pixels), place in zip(pictures.items(), places, strict=True):
-        Image.fromarray(pixels).save(folder / name)
-        pose = np.eye(4)
-        pose[axis, 3] = place
-        poses[name] = {"cam2world": pose.tolist()}
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    return folder
-
-
 def _write_pair(folder: Path, *, height: int = 16, seed: int = 0) -> Path:
     pixels = np.random.default_rng(seed).integers(0, 255, (2, height, 2 * height, 3), dtype=np.uint8)
-    return _write_posed(folder, {"left.png": pixels[0], "right.png": pixels[1]}, (0, 0.5))
+    return write_posed(folder, {"left.png": pixels[0], "right.png": pixels[1]}, (0, 0.5))
 
 
 @pytest.fixture(scope="session")
@@ -254,7 +241,7 @@ def write_room() -> Callable[..., Path]:
     def write(folder: Path, *, height: int = 64, baseline: float = 1.0, target: bool = True) -> Path:
         pixels = np.random.default_rng(0).integers(0, 255, (3, height, 2 * height, 3), dtype=np.uint8)
         names = ["a.png", "b.png", "c.png"]
-        _write_posed(folder, dict(zip(names, pixels, strict=True)), (0, baseline, baseline / 2))
+        write_posed(folder, dict(zip(names, pixels, strict=True)), (0, baseline, baseline / 2))
         case = {"context": names[:2]} | ({"target": "c.png"} if target else {})
         (folder / "pairs.json").write_text(json.dumps({"pairs": [case]}))
         return folder
@@ -269,7 +256,7 @@ def _write_tour(folder: Path, count: int = 3, *, height: int = 16) -> Path:
         name: np.concatenate((halves[index + index % 2], halves[index + 1 - index % 2]), axis=1)
         for index, name in enumerate(names)
     }
-    _write_posed(folder, pictures, 0.5 * np.arange(count), axis=2)
+    write_posed(folder, pictures, 0.5 * np.arange(count), axis=2)
     pairs = [{"context": [a, b]} for a, b in itertools.pairwise(names)]
     (folder / "pairs.json").write_text(json.dumps({"pairs": pairs}))
     return folder

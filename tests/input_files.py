@@ -23,11 +23,11 @@ from pansplat.cache import CachedScene, _is_valid
 from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.gaussians.scene_files import format_entry, make_scene
 from pansplat.images.cube_images import CubeImage, CubeLevel, write_cube
 from pansplat.images.image_files import read_depth, read_height, read_panorama, write_image
-from pansplat.inputs.folders import load_pairs, load_panoramas
+from pansplat.inputs.folders import load_panoramas, load_sets
 from pansplat.inputs.formats import FORMATS
 from pansplat.model.network import build_empty_network
 from pansplat.model.pansplat import PanSplatConfig
@@ -56,9 +56,8 @@ SCENE = Scene(
     model="sweep",
     height=64,
     gains=((1.0, 1.0, 1.0), (1.0, 0.9, 1.0)),
-    overlaps=((0, 1, 0.5),),
-    links=((0, 1, 0.1, 0.2, "door"),),
     starts=((0.1, 0.2), None),
+    tour=SceneTour(((0, 1, 0.5),), ((0, 1, 0.1, 0.2, "door"),)),
 )
 
 
@@ -138,7 +137,7 @@ def _make_pair(folder: Path, name: str, document: Any, **others: Any) -> InputFi
     write_room(folder, _NAMES)
     for other, content in others.items():
         (folder / f"{other}.json").write_text(json.dumps(content))
-    return _make_json(folder / name, document, lambda path: load_pairs(folder))
+    return _make_json(folder / name, document, lambda path: load_sets(folder))
 
 
 def _make_scene(folder: Path, suffix: str) -> InputFile:

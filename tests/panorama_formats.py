@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,21 @@ def write_room(folder: Path, names: Names = ("a.png", "b.png")) -> Path:
 def move(x: float) -> list[list[float]]:
     """The pose of a camera at x."""
     return (np.eye(4) + x * np.eye(4, k=3)).tolist()
+
+
+def write_posed(
+    folder: Path, pictures: dict[str, np.ndarray], places: Iterable[float], axis: int = 0, **fields: Any
+) -> Path:
+    """Pictures (H 2H 3) of cameras on an axis, and their poses.json with more fields."""
+    folder.mkdir(parents=True, exist_ok=True)
+    poses = {}
+    for (name, pixels), place in zip(pictures.items(), places, strict=True):
+        Image.fromarray(pixels).save(folder / name)
+        pose = np.eye(4)
+        pose[axis, 3] = place
+        poses[name] = {"cam2world": pose.tolist()}
+    _write(folder / "poses.json", {"convention": "cam2world opencv", "poses": poses, **fields})
+    return folder
 
 
 def _write(path: Path, content: Any) -> None:

@@ -15,8 +15,8 @@ from PIL import Image
 from refusals import expect_error
 
 from pansplat.gaussians.scene import Scene
-from pansplat.inputs.pairs import Note, Pair
-from pansplat.pipeline import load_pairs, predict
+from pansplat.inputs.panorama_sets import Note, PanoramaSet
+from pansplat.pipeline import load_sets, predict
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.progress import show_progress
 from pansplat.system.store import cache_folders
@@ -79,31 +79,14 @@ def test_any_change_of_the_pair_causes_a_new_prediction(
 
 def test_another_predictor_or_height_causes_a_new_prediction(pair_folder: Path, sphere_predictor) -> None:
     old, new = sphere_predictor("1"), sphere_predictor("2")
-    predict(pair_folder, old, height=HEIGHT)
-    predict(pair_folder, new, height=HEIGHT)
-    predict(pair_folder, new, height=2 * HEIGHT)
+    for predictor, height in ((old, HEIGHT), (new, HEIGHT), (new, 2 * HEIGHT)):
+        predict(pair_folder, predictor, height=height)
     assert new.calls == 2
 
 
-def test_renamed_images_do_not_invalidate_the_cache(pair_folder: Path, sphere_predictor) -> None:
+def test_loaded_views_and_predictions_without_a_cache_leave_no_file(pair_folder: Path, sphere_predictor) -> None:
     predictor = sphere_predictor()
-    predict(pair_folder, predictor, height=HEIGHT)
-    (pair_folder / "right.png").rename(pair_folder / "other.png")
-    poses = (pair_folder / "poses.json").read_text().replace("right.png", "other.png")
-    (pair_folder / "poses.json").write_text(poses)
-    assert predict(pair_folder, predictor, height=HEIGHT).names == ("left", "other")
-
-
-def test_cache_false_reads_and_writes_no_file(pair_folder: Path, sphere_predictor) -> None:
-    predictor = sphere_predictor()
-    for _ in range(2):
-        predict(pair_folder, predictor, height=HEIGHT, cache=False)
-    assert predictor.calls == 2 and not (pair_folder / ".pansplat").exists()
-
-
-def test_loaded_views_are_not_cached(pair_folder: Path, sphere_predictor) -> None:
-    predictor = sphere_predictor()
-    pair = load_pairs(pair_folder)[0]
+    pair = load_sets(pair_folder)[0]
     views = pair.load_context(HEIGHT)
     assert have_equal_gaussians(predict(views, predictor), predict(pair, predictor, height=HEIGHT, cache=False))
     assert not any(folder.exists() for folder in cache_folders(pair.folder))
@@ -171,12 +154,17 @@ def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_fol
 def test_one_content_has_one_entry_whatever_names_and_paths_are(pair_folder: Path, sphere_predictor) -> None:
     predictor, other = sphere_predictor(), sphere_predictor()
     other.name = "a copy of the weights"
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     view = dataclasses.replace(pair.context[0], title="客厅", notes=(Note(0.0, 0.0, "old"),))
-    named = dataclasses.replace(pair, name="x" * 300, context=(view, pair.context[1]))
-    scenes = [predict(each, model, height=HEIGHT) for each in (pair, named) for model in (predictor, other)]
+    scenes = [predict(pair, model, height=HEIGHT) for model in (predictor, other)]
+    (pair_folder / "right.png").rename(pair_folder / "other.png")
+    poses = (pair_folder / "poses.json").read_text().replace("right.png", "other.png")
+    (pair_folder / "poses.json").write_text(poses)
+    named = dataclasses.replace(pair, name="x" * 300, context=(view, load_sets(pair_folder)[0].context[1]))
+    named = dataclasses.replace(named, siblings=tuple(each.image for each in named.context))
+    scenes += [predict(named, model, height=HEIGHT) for model in (predictor, other)]
     assert predictor.calls + other.calls == 1 and len(list((pair_folder / ".pansplat").iterdir())) == 1
-    assert scenes[3].names == ("客厅", "right") and scenes[3].model == other.name
+    assert scenes[3].names == ("客厅", "other") and scenes[3].model == other.name
 
 
 @pytest.mark.usefixtures("any_state")
@@ -184,7 +172,7 @@ def test_a_cached_scene_is_opened_without_its_photographs(
     gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_steps=s) for s in (0, 8)]
-    monkeypatch.setattr(Pair, "load_context", lambda *_: pytest.fail("it is decoded"))
+    monkeypatch.setattr(PanoramaSet, "load_context", lambda *_: pytest.fail("it is decoded"))
     again = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_steps=s) for s in (0, 8)]
     for before, after in zip(first, again, strict=True):
         assert have_equal_gaussians(before, after) and torch.equal(before.cam2world, after.cam2world)

@@ -86,7 +86,7 @@ def test_a_large_rendering_is_shown_smaller_and_other_channels_as_text() -> None
 
 
 def test_views_and_pairs_are_pictures_of_their_panoramas(pair_folder: Path) -> None:
-    (pair,) = pansplat.load_pairs(pair_folder)
+    (pair,) = pansplat.load_sets(pair_folder)
     assert open_picture(display(pair)).shape[:2] == (256, 1024)
     images = torch.stack([torch.zeros(3, 16, 32), torch.ones(3, 16, 32), torch.zeros(3, 16, 32)])
     poses, masks = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1), torch.ones(3, 16, 32, dtype=torch.bool)
@@ -96,7 +96,7 @@ def test_views_and_pairs_are_pictures_of_their_panoramas(pair_folder: Path) -> N
 
 
 def test_a_pair_whose_files_are_missing_is_text(pair_folder: Path) -> None:
-    (pair,) = pansplat.load_pairs(pair_folder)
+    (pair,) = pansplat.load_sets(pair_folder)
     (pair_folder / "left.png").unlink()
     assert set(display(pair)) == {"text/plain"}
 

@@ -1,5 +1,6 @@
 """Predict into memory or a file, render, save and load."""
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -18,14 +19,16 @@ from pansplat.cli import run
 from pansplat.errors import InputWarning
 from pansplat.gaussians.harmonics import official_harmonics
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.model import network
 from pansplat.model.pansplat import PanSplat
 from pansplat.networks.weights import pack_weights, save_weights
-from pansplat.pipeline import load, load_pairs, predict, predict_to_file, predict_tour, render, save
+from pansplat.pipeline import load, load_sets, predict, predict_to_file, predict_tour, render, save
 from pansplat.prediction_options import PredictOptions
 from pansplat.rendering import blend, rasterize
-from pansplat.tours.graph import TourGraph, find_tours, select_views
+from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.tours.merge import select_views
+from pansplat.tours.scene_views import choose_sources
 
 HEIGHT = 16
 
@@ -42,7 +45,7 @@ def test_a_predicted_scene_holds_its_cameras_and_predictor_name(scene: Scene) ->
 
 
 def test_a_scene_of_one_panorama_keeps_its_title_and_start_view(pair_folder: Path, sphere_predictor) -> None:
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     single = replace(pair, context=(replace(pair.context[1], title="hall", start=(7.0, 0.1)),))
     for cache in (True, True, False):
         scene = predict(single, sphere_predictor(), height=HEIGHT, cache=cache)
@@ -55,7 +58,7 @@ def test_a_scene_of_one_panorama_keeps_its_title_and_start_view(pair_folder: Pat
 def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predictors_limit(
     pair_folder: Path, sphere_predictor, photographs: int, largest: int | None, expected: int
 ) -> None:
-    predictor, pair = sphere_predictor(), pipeline.load_pairs(pair_folder)[0]
+    predictor, pair = sphere_predictor(), pipeline.load_sets(pair_folder)[0]
     if largest is not None:
         predictor.default_height = largest
     for panorama, height in zip(pair.context, (photographs, 2 * photographs), strict=True):
@@ -68,12 +71,12 @@ def test_the_default_height_is_that_of_the_smallest_photograph_within_the_predic
 def test_a_single_view_has_the_scale_of_its_camera_height(tmp_path: Path, sphere_predictor, write_pair) -> None:
     photograph = write_pair(tmp_path / "pair") / "left.png"
     usual, tall = (
-        predict(load_pairs(photograph, camera_height=height)[0], sphere_predictor(), height=64) for height in (1.5, 3.0)
+        predict(load_sets(photograph, camera_height=height)[0], sphere_predictor(), height=64) for height in (1.5, 3.0)
     )
     assert torch.equal(tall.gaussians.means, 2 * usual.gaussians.means)  # its camera is at the origin
     assert torch.equal(tall.gaussians.scales, 2 * usual.gaussians.scales)
     assert torch.equal(tall.cam2world, usual.cam2world)
-    expect_error("camera_height", load_pairs, photograph, camera_height=0.0)
+    expect_error("camera_height", load_sets, photograph, camera_height=0.0)
 
 
 def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_camera_height(
@@ -81,14 +84,14 @@ def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_ca
 ) -> None:
     folder = write_pair(tmp_path / "pair")
     (folder / "poses.json").unlink()
-    shown: list[Pair] = []
+    shown: list[PanoramaSet] = []
 
-    def stop(pairs: list[Pair]) -> None:
+    def stop(pairs: list[PanoramaSet]) -> None:
         shown.extend(pairs)
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        load_pairs(folder, camera_height=3.0, on_unposed=stop)
+        load_sets(folder, camera_height=3.0, on_unposed=stop)
     assert [view.camera_height for pair in shown for view in pair.context] == [3.0, 3.0]
 
 
@@ -145,14 +148,14 @@ def test_a_folder_of_several_pairs_names_the_call_for_all_of_it_which_takes_its_
     house = write_tour(tmp_path / "house", 4)
     expect_error(r"holds 3 pairs .*predict_tour", lambda: predict(house, sphere_predictor()))
     scene = predict_tour(house, sphere_predictor(), height=64, cache=False)
-    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.overlaps) >= 3
+    assert scene.names == ("p0", "p1", "p2", "p3") and len(scene.tour.overlaps) >= 3
     expect_error("0 tours", lambda: predict_tour(write_pair(tmp_path / "pair"), sphere_predictor()))
 
 
 def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_their_holes(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor
 ) -> None:
-    (tour,) = find_tours(load_pairs(write_tour(tmp_path / "house", 4)))
+    (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
     pose = torch.eye(4, dtype=torch.float64)
     pose[2, 3] = 0.4 * 0.5  # between the first two of four panoramas in a row, 0.5 m apart
@@ -166,18 +169,18 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
     torch.testing.assert_close(*colors, atol=1e-5, rtol=0)
     others = render(select_views(cut, (2, 3)), pose, size=(32, 64))
     assert (drawn.alpha[hole] == others.alpha[hole]).all() and others.alpha[hole].min() > 0.9
-    assert not torch.allclose(of_edge.color, render(replace(cut, overlaps=()), pose, size=(32, 64)).color, atol=0.05)
+    assert not torch.allclose(of_edge.color, render(replace(cut, tour=None), pose, size=(32, 64)).color, atol=0.05)
 
 
 @pytest.mark.parametrize("blending", ["deferred", "joint"])
 def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor, blending: str
 ) -> None:
-    pairs = load_pairs(write_tour(tmp_path / "house", 3))
+    pairs = load_sets(write_tour(tmp_path / "house", 3))
     alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
     whole = predict_tour(tour, sphere_predictor(), height=64, cache=False)
-    assert [edge[:2] for edge in whole.overlaps] == [(0, 1), (2, 2)]
+    assert [edge[:2] for edge in whole.tour.overlaps] == [(0, 1), (2, 2)]
     options = {"size": (32, 64), "blend": blending}
     for views in ((0, 1), (2,)):
         pose = tour.cam2world[views[0]].clone()
@@ -284,6 +287,8 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     count = predict_to_file(masked_pair, tmp_path / "tiles.ply", weights, height=TILED_HEIGHT)
     tiles = load(tmp_path / "tiles.ply")
     assert count == len(tiles.gaussians) == len(scene.gaussians) > 1000
+    assert count == predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
+    assert count == len(load(tmp_path / "tiles.glb").gaussians)
     assert 0 < int((tiles.gaussians.views == 0).sum()) < int((tiles.gaussians.views == 1).sum())  # masked
     np.testing.assert_allclose(_sorted_columns(tiles.gaussians), _sorted_columns(whole.gaussians), atol=1e-5)
     assert not torch.equal(tiles.gaussians.means, whole.gaussians.means)  # ordered by tile
@@ -294,7 +299,7 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
 def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(
     tmp_path: Path, write_pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (pair,) = load_pairs(write_pair(tmp_path / "pair", height=64))
+    (pair,) = load_sets(write_pair(tmp_path / "pair", height=64))
     for height, rows in ((16, 32), (48, 64), (64, 64)):
         assert pipeline.load_photographs(pair, height).images.shape[-2] == rows
     monkeypatch.setattr(pipeline.prediction, "DISPLAY_HEIGHT", 24)
@@ -317,13 +322,6 @@ def test_the_predict_command_streams_large_predictions(
     np.testing.assert_allclose(_sorted_columns(tiles), _sorted_columns(whole), atol=1e-5)
 
 
-@pytest.mark.slow
-def test_tiles_are_written_in_every_format(masked_pair: Path, weights: Path, tmp_path: Path) -> None:
-    count = predict_to_file(masked_pair, tmp_path / "tiles.glb", weights, height=TILED_HEIGHT)
-    scene = predict(masked_pair, weights, height=TILED_HEIGHT, cache=False)
-    assert count == len(scene.gaussians) == len(load(tmp_path / "tiles.glb").gaussians)
-
-
 def test_predictions_are_written_in_the_format_of_the_suffix(
     pair_folder: Path, tmp_path: Path, sphere_predictor: type
 ) -> None:
@@ -338,13 +336,13 @@ def test_predictions_are_written_in_the_format_of_the_suffix(
 def test_the_scene_of_a_tour_holds_each_panorama_once(
     tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor: type
 ) -> None:
-    (tour,) = find_tours(load_pairs(write_tour(tmp_path / "house", 4)))
+    (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     predictor = sphere_predictor()
     scene = predict_tour(tour, predictor, cache=False)
-    assert predictor.calls == len(tour.choose_sources()) == 3
+    assert predictor.calls == len(choose_sources(tour)) == 3
     assert scene.gaussians.views.bincount().tolist() == [64 * 128] * 4  # the smallest height
     assert scene.cam2world.equal(tour.cam2world) and scene.names == tuple(f"p{k}" for k in range(4))
-    assert [edge[:2] for edge in scene.overlaps] == list(tour.overlaps)
+    assert [edge[:2] for edge in scene.tour.overlaps] == list(tour.overlaps)
     distances = (scene.gaussians.means - scene.cam2world[scene.gaussians.views, :3, 3].float()).norm(dim=1)
     torch.testing.assert_close(distances, torch.full_like(distances, 2.0))
     predictor.calls, predictor.max_views = 0, 4
@@ -368,7 +366,7 @@ class PairsOnly:
 @pytest.fixture
 def parted_tour(tmp_path: Path, write_tour: Callable[..., Path]) -> TourGraph:
     """Two panoramas that are a pair, and one of another part."""
-    pairs = load_pairs(write_tour(tmp_path / "house", 3))
+    pairs = load_sets(write_tour(tmp_path / "house", 3))
     alone = replace(pairs[1], name="p2", context=(replace(pairs[1].context[1], world=1),))
     (tour,) = find_tours([pairs[0], alone])
     return tour
@@ -387,7 +385,7 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
 
 
 def test_a_photograph_alone_is_refused_by_a_model_that_needs_two(pair_folder: Path, weights: Path) -> None:
-    (single,) = load_pairs(pair_folder / "left.png")
+    (single,) = load_sets(pair_folder / "left.png")
     message = r"left\.png: pansplat needed 2 or more panoramas of one room, got 1; choose the model default"
     for run_prediction in (predict, lambda pair, model: predict_to_file(pair, pair_folder / "x.ply", model)):
         expect_error(message, run_prediction, single, weights)
@@ -421,22 +419,29 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return write
 
 
+@pytest.fixture(scope="module")
+def predict_room(room: Callable[[str], Path]) -> Callable[..., Scene]:
+    """Predict the room of a frame, its places moved in the working world, at 64 rows; each once."""
+
+    @functools.cache
+    def run_prediction(name: str, *moved: float) -> Scene:
+        views = load_sets(room(name))[0].load_context(64)
+        cam2world = views.cam2world.clone()
+        cam2world[:, :3, 3] += torch.tensor(moved or (0.0, 0.0, 0.0), dtype=torch.float64)
+        return predict(replace(views, cam2world=cam2world), "sweep")
+
+    return run_prediction
+
+
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
 def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
-    name: str, room: Callable[[str], Path]
+    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene]
 ) -> None:
     unit, origin = FRAMES[name]
     # An origin of the working world is a multiple of 64 m; that of the poses is not.
-    moved = torch.tensor([0.0, 32.0, 16.0] if origin else [0.0] * 3, dtype=torch.float64)
-    (in_metres,), (pair,) = load_pairs(room("metres")), load_pairs(room(name))
-    views = in_metres.load_context(64)
-    cam2world = views.cam2world.clone()
-    cam2world[:, :3, 3] += moved
-    views = replace(views, cam2world=cam2world)
-    found = pair.load_context(64)
-    assert torch.equal(found.cam2world, cam2world) and (found.near, found.far) == (views.near, views.far)
-    assert found.frame.unit == unit
-    expected, scene = predict(views, "sweep"), predict(pair, "sweep", height=64, cache=False)
+    expected, scene = predict_room("metres", *((0.0, 32.0, 16.0) if origin else ())), predict_room(name)
+    assert torch.equal(scene.cam2world, expected.cam2world) and scene.frame.unit == unit
+    assert (scene.near, scene.far) == (expected.near, expected.far)
     for field in fields(Gaussians):
         assert torch.equal(getattr(scene.gaussians, field.name), getattr(expected.gaussians, field.name)), field.name
     size = (64, 128)
@@ -447,15 +452,14 @@ def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
 
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
 def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
-    name: str, room: Callable[[str], Path], tmp_path: Path
+    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene], tmp_path: Path
 ) -> None:
-    folder, size, unit = room(name), (64, 128), FRAMES[name][0]
-    scene = predict(folder, "sweep", height=64, cache=False)
+    folder, size, unit, scene = room(name), (64, 128), FRAMES[name][0], predict_room(name)
     ours = render(scene, scene.cam2world[0], size=size).color
     pose = json.loads((folder / "poses.json").read_text())["poses"]["left.jpg"]["cam2world"]
     users = torch.tensor(pose, dtype=torch.float64)
-    suffixes = ("ply", "glb", "compressed.ply", "sog", *(["spz"] if unit == 1 else []))  # .spz ends at 2048
-    for file in (f"scene.{suffix}" for suffix in suffixes):
+    coded = {"millimetres": ("compressed.ply", "sog"), "UTM": ("compressed.ply", "spz"), "UTM in millimetres": ()}
+    for file in (f"scene.{suffix}" for suffix in ("ply", "glb", *coded[name])):
         save(scene, tmp_path / file)
         loaded = load(tmp_path / file)
         torch.testing.assert_close(loaded.frame.globalize(loaded.cam2world)[0], users, rtol=1e-12, atol=1e-7)
@@ -472,11 +476,9 @@ def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
 
 
 def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(
-    room: Callable[[str], Path], tmp_path: Path
+    room: Callable[[str], Path], predict_room: Callable[..., Scene]
 ) -> None:
-    (pair,) = load_pairs(room("UTM"))
-    views = pair.load_context(64)
-    scene = predict(views, "sweep")
+    views, scene = load_sets(room("UTM"))[0].load_context(64), predict_room("UTM")
     x, y, z = scene.frame.origin
     frame = replace(scene.frame, origin=(x - 512.0, y, z))
     moved = replace(views, frame=frame, cam2world=frame.localize(scene.frame.globalize(scene.cam2world)))
@@ -486,7 +488,7 @@ def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin
 
 
 def test_views_of_arrays_and_of_bytes_are_those_of_tensors(pair_folder: Path, sphere_predictor) -> None:
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     views = pair.load_context(HEIGHT)
     expected = predict(views, sphere_predictor()).gaussians.harmonics
     arrays = replace(

@@ -12,11 +12,10 @@ import torch
 from refusals import expect_error
 
 from pansplat.gaussians import formats
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat.networks.weights import load_weights, pack_weights, save_weights
 from pansplat.system import console
 from pansplat.system.files import make_portable_name, require_output_folder
-from pansplat.system.kernel_cache import choose_kernel_cache
 
 
 @pytest.fixture
@@ -49,17 +48,13 @@ def test_a_picture_that_poses_name_in_other_capitals_is_one_picture(pair_folder:
     content["poses"]["LEFT.PNG"] = content["poses"].pop("left.png")
     (pair_folder / "poses.json").write_text(json.dumps(content))
     os.link(pair_folder / "left.png", pair_folder / "LEFT.PNG")  # as if the file system ignored capitals
-    (pair,) = load_pairs(pair_folder)
+    (pair,) = load_sets(pair_folder)
     assert sorted(view.image.name for view in pair.context) == ["LEFT.PNG", "right.png"]
 
 
 def test_a_drive_that_does_not_exist_ends_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os.path, "lexists", lambda _: False)
     expect_error("needed an existing drive", lambda: require_output_folder("--out", Path("/nowhere/at/all")))
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    environment = {"XDG_CACHE_HOME": "/nowhere"}
-    choose_kernel_cache("/nowhere", environment)
-    assert Path(environment["NUMBA_CACHE_DIR"]).is_dir()
 
 
 # Files that are in use

@@ -243,7 +243,9 @@ def _find_part(entry: SceneEntry) -> float:
     tour = entry.tour
     if tour is None:
         return 1.0
-    first = tour.parts[tour.plan_walk()[0]]  # the part that a tour begins with
+    from pansplat.tours.walks import plan_walk
+
+    first = tour.parts[plan_walk(tour)[0]]  # the part that a tour begins with
     return (len(entry.views) or tour.parts.count(first)) / len(tour)
 
 

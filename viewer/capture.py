@@ -18,6 +18,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.path import fly_pose
 from pansplat.images.image_files import write_image
 from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
+from pansplat.tours.walks import plan_walk
 from pansplat_viewer.draw.frame_renderer import FrameRenderer, render_image
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, make_file_name
@@ -125,7 +126,7 @@ def write_flight(
         for still in STILLS:
             stills.setdefault(round(still * (len(shots) - 1)), []).append(f"view_{round(100 * still):03d}.png")
     else:
-        tour, route = scenes.tour, plan_route(scenes.tour, scenes.tour.plan_walk(), rest=REST_SECONDS)
+        tour, route = scenes.tour, plan_route(scenes.tour, plan_walk(scenes.tour), rest=REST_SECONDS)
         shots = list_flight(route, fps, FIELD_OF_VIEW, seconds)
         for node, at in route.visits.items():
             still = f"{node + 1:02d}_{make_file_name(tour.panoramas[node].label)}.png"

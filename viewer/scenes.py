@@ -16,9 +16,10 @@ import torch
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
-from pansplat.inputs.pairs import Panorama
-from pansplat.tours.graph import list_starts
+from pansplat.inputs.panorama_sets import Panorama
+from pansplat.tours.merge import list_starts
 from pansplat.tours.route import plan_route
+from pansplat.tours.walks import plan_walk
 from pansplat_viewer.scene import camera as cameras
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
@@ -336,7 +337,7 @@ class Scenes:
         if entry.tour is None:
             enter_scene(self._state, scene, at=self._at)
         else:
-            enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, entry.tour.plan_walk()), at=self._at)
+            enter_tour(self._state, entry.tour, scene, plan_route(entry.tour, plan_walk(entry.tour)), at=self._at)
             self.tour = TourScenes(entry.tour)
         self._keep_view(view, entry.panoramas)
         nearest = photographs.find_nearest(np.asarray(self._state.camera.position))
@@ -381,7 +382,7 @@ class Scenes:
         assert tour is not None
         self._stage.add_slot()
         self.tour = TourScenes.start(loaded)
-        enter_tour(state, tour, loaded.scene, plan_route(tour, tour.plan_walk(loaded.entry.start)), at=self._at)
+        enter_tour(state, tour, loaded.scene, plan_route(tour, plan_walk(tour, loaded.entry.start)), at=self._at)
         self.tour.move(np.asarray(state.camera.position))
         if remaining:
             state.route, state.playing = self.tour.plan_route(state.camera.cam2world, remaining), True

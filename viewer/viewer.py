@@ -25,7 +25,7 @@ from imgui_bundle import imgui
 from pansplat.errors import InputError
 from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
-from pansplat.inputs.pairs import Note
+from pansplat.inputs.panorama_sets import Note
 from pansplat.inputs.photographs import read_notes, write_notes
 from pansplat.inputs.web_tours.entries import make_note
 from pansplat.system.files import require_replaceable

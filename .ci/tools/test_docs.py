@@ -81,7 +81,7 @@ def test_pose_files_of_the_readme_are_read(tmp_path: Path) -> None:
     (tmp_path / "poses.json").write_text(poses)
     for name in ("left.jpg", "right.jpg"):
         cv2.imwrite(str(tmp_path / name), np.zeros((8, 16, 3), np.uint8))
-    (pair,) = pansplat.load_pairs(tmp_path)
+    (pair,) = pansplat.load_sets(tmp_path)
     assert [panorama.image.name for panorama in pair.context] == ["left.jpg", "right.jpg"]
     assert (pair.near, pair.far) == (0.45, 10.0)
 

@@ -45,8 +45,8 @@ class Suite:
     """What the rows of one benchmark have in common.
 
     Attributes:
-        name: of its files: NAME.json, NAME.md and NAME.png.
-        columns: of its tables.
+        name: the start of the names of its files: NAME.json, NAME.md and NAME.png.
+        columns: the columns of its tables.
         section: title of the table that a row belongs to.
         plot: a function that plots the rows, given also the header of the JSON file; None if there is nothing to plot.
         findings: sentences about all rows, for the terminal and the page.

@@ -61,7 +61,7 @@ class ModelCase:
 
     Attributes:
         compat, precision, attention: as in `pansplat.model.network.load_predictor`.
-        threads: of torch.
+        threads: number of torch's threads.
         tiles: along each side of the panorama, for the heads.
     """
 

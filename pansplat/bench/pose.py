@@ -27,8 +27,8 @@ from numpy import ndarray as Array
 from pansplat.bench.harness import Suite, announce
 from pansplat.errors import InputError
 from pansplat.evaluation.results import Column, Row
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle
 
@@ -44,7 +44,7 @@ def measure_folder(path: Path, *, camera_height: float, pairs: bool, tours: bool
         pairs: estimate each pair by itself.
         tours: estimate all panoramas together.
     """
-    loaded = [pair for pair in load_pairs(path) if len(pair.context) > 1]  # a single view has nothing to compare with
+    loaded = [pair for pair in load_sets(path) if len(pair.context) > 1]  # a single view has nothing to compare with
     contexts = {frozenset(view.image for view in pair.context): pair for pair in loaded}
     for pair in contexts.values() if pairs else ():
         announce(pair.name)

@@ -67,7 +67,7 @@ class RasterCase:
         backend: "torch", "numba" or "triton".
         height: pixels; a panorama is twice as wide, a pinhole image square with a field of view of 90 degrees.
         kernel, layout: as in `pansplat.rasterize`.
-        face_size: of the faces of a cubemap, pixels.
+        face_size: along the faces of a cubemap, pixels.
         threads: the largest number to use.
         backward: whether the backward pass is timed as well.
     """
@@ -163,7 +163,7 @@ def list_raster_groups(height: int, backends: Sequence[str], threads: int) -> li
     """The main choices on the room of this height, and also pinhole images on the one of `choice_height`.
 
     Args:
-        height: of the largest images, pixels.
+        height: rows of the largest images.
         backends: available ones besides torch.
         threads: the largest number to use.
     """
@@ -205,7 +205,7 @@ def measure_raster(groups: Iterable[Group], *, budget: float = 2.0, slow: float 
     """Yield the row of each case, and yield it again after each repeat.
 
     Args:
-        groups: of cases, each with its scene.
+        groups: cases, each group with its scene.
         budget: seconds for the repeats of a case.
         slow: seconds; a case whose first image takes longer is not repeated.
     """

@@ -28,7 +28,7 @@ from pansplat.evaluation.metrics import cross_fade, ws_psnr
 from pansplat.evaluation.report import measure_own_views, warm_up
 from pansplat.evaluation.results import Column, Row, average_rows
 from pansplat.gaussians.scene import Scene
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Views, select_views
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, Refinement
@@ -45,8 +45,8 @@ class RefineCase:
 
     Attributes:
         model: name of a predictor, or `CROSS_FADE`.
-        height: of the panoramas, pixels.
-        limit_steps: of the refinement; 0 for none.
+        height: rows of the panoramas.
+        limit_steps: largest number of steps of the refinement; 0 for none.
         limit_gaussians: None for no limit.
         views: number of the pair's panoramas that the scene is made of; None for all.
     """
@@ -80,7 +80,7 @@ def list_refine_cases(*, quick: bool) -> list[RefineCase]:
 _MEAN_ENTRIES = ("suite", *RefineCase.__dataclass_fields__)  # entries of the rows of means over the pairs
 
 
-def measure_refine(pairs: Sequence[Pair], cases: Sequence[RefineCase], lpips: Lpips | None) -> Iterator[Row]:
+def measure_refine(pairs: Sequence[PanoramaSet], cases: Sequence[RefineCase], lpips: Lpips | None) -> Iterator[Row]:
     """Yield the row of every case on every pair with targets, then the means over the pairs.
 
     Args:

@@ -14,7 +14,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.geometry.pose import quats_from_rotations
 
-NUM_LEVELS = 4
+NUM_LEVELS = 4  # levels of lattices, as the paper has
 _BASELINE = 1.0  # metres between the two cameras
 _CHUNK = 1 << 17  # rays that are cast at once
 
@@ -56,7 +56,7 @@ def full_lattice_room(height: int, *, views: int = 2) -> Gaussians:
     sizes and overlaps of a predicted scene. The order is level, view, lattice point. Deterministic.
 
     Args:
-        height: of the panoramas, pixels; a multiple of 8.
+        height: rows of the panoramas; a multiple of 8.
         views: number of input cameras.
 
     Returns:

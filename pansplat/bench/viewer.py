@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 View = Literal["perspective", "coarse", "look-around", "panorama"]
 Mode = Literal["joint", "deferred"]
 
-FOV_DEGREES = 75.0
+FOV_DEGREES = 75.0  # vertical, as in the window
 RENDERERS = ("cpu", "gl")
-_PANORAMA_SIZE = (1024, 512)  # pixels
+_PANORAMA_SIZE = (1024, 512)  # width and height of panoramas, pixels
 _MAX_REFERENCE = 1_000_000  # Gaussians; float64 takes a minute beyond
 _VIEWER_PACKAGE = "pansplat_viewer"
 _RATES = (15, 60)  # lines of the plot, frames per second
@@ -58,7 +58,7 @@ class ViewerCase:
         view: `perspective` moves; `coarse` moves at half the resolution; `look-around` turns and reads cube faces;
             `panorama` has all directions; OpenGL stitches it from six cube faces.
         mode: `joint` or `deferred`.
-        width, height: of the image, pixels.
+        width, height: the size of the image, pixels.
     """
 
     renderer: str
@@ -108,7 +108,7 @@ def measure_viewer(height: int, cases: Sequence[ViewerCase], *, repeats: int, th
 
     Args:
         repeats: frames of each case; OpenGL draws a third.
-        threads: of numba and of software OpenGL.
+        threads: number of threads of numba and of software OpenGL.
     """
     if importlib.util.find_spec(_VIEWER_PACKAGE) is None:
         raise InputError("the viewer is not installed; install all of pansplat to measure it")

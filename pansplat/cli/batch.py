@@ -140,17 +140,17 @@ class Batch(Computation):
         """The names of the outputs of a folder, and the commands that write them."""
         from pansplat import pipeline
         from pansplat.inputs.content import hash_panorama, hash_pixels
-        from pansplat.inputs.pairs import Pair
+        from pansplat.inputs.panorama_sets import PanoramaSet
         from pansplat.system.store import hash_parts
         from pansplat.tours.graph import find_tours
 
-        pairs, found = pipeline.load_pairs(folder, **vars(self.reading)), {}
+        pairs, found = pipeline.load_sets(folder, **vars(self.reading)), {}
         tours = find_tours(pairs)
         images = {panorama.image for tour in tours for panorama in tour.panoramas}
         for source in (*tours, *(pair for pair in pairs if pair.context[0].image not in images)):
-            panoramas = source.context if isinstance(source, Pair) else source.panoramas
+            panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
             content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
-            edges = () if isinstance(source, Pair) else source.list_overlaps()
+            edges = () if isinstance(source, PanoramaSet) else source.list_overlaps()
             for step in (step for step in STEPS if step in self.steps):
                 options = self.prediction
                 if step == "predict" or "refine" not in self.steps:

@@ -13,7 +13,7 @@ from tyro.conf import Positional, subcommand
 
 import pansplat
 from pansplat.cli.evaluate import LpipsChoice, choose_lpips
-from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_pair, predict_scene
+from pansplat.cli.inputs import OptionalOut, PairChoice, Writer, choose_set, predict_scene
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.files import require_output_folder, require_replaceable
@@ -82,7 +82,7 @@ class BenchRaster(_Options):
         groups = raster.list_raster_groups(height, backends, threads)
         if _SAMPLE.is_dir():
             options = PredictOptions("sweep", height=max(small, MIN_HEIGHT), refine_steps=0)
-            scene = predict_scene(choose_pair(_SAMPLE, PairChoice()), options)
+            scene = predict_scene(choose_set(_SAMPLE, PairChoice()), options)
             sample = raster.BenchScene(_SAMPLE.stem, lambda: scene.gaussians, scene.pose_between(0.5))
             groups.append(raster.make_sample_group(sample, small, backends, threads))
         budget = 0.2 if self.quick else 2.0
@@ -114,7 +114,7 @@ class BenchModel(_Options):
         folder = self.pair or _SAMPLE
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give one with --pair (the sample is in the repository only)")
-        views = choose_pair(folder, PairChoice()).load_context(self.height)
+        views = choose_set(folder, PairChoice()).load_context(self.height)
         bfloat16 = has_bfloat16()
         cases = list_model_cases(threads, bfloat16=bfloat16, quick=self.quick)
         with tempfile.TemporaryDirectory() as temporary:
@@ -145,7 +145,7 @@ class BenchRefine(_Options):
         from pansplat.bench.refine import REFINE, list_refine_cases, measure_refine
 
         self._check("refine")
-        found = [pair for path in _paths_or_sample(self.paths) for pair in pipeline.load_pairs(path)]
+        found = [pair for path in _paths_or_sample(self.paths) for pair in pipeline.load_sets(path)]
         pairs = [pair for pair in found if pair.targets]
         if not pairs:
             raise InputError(f"none of the {len(found)} pairs has a target view to compare with")

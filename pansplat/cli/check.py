@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import PairChoice, choose_pair
+from pansplat.cli.inputs import PairChoice, choose_set
 from pansplat.system.console import make_table_console
 
 
@@ -25,7 +25,7 @@ class Check:
 
         from pansplat.evaluation.pose_check import AS_GIVEN, check_pair
 
-        check = check_pair(choose_pair(self.path, self.choice))
+        check = check_pair(choose_set(self.path, self.choice))
         table = Table(title=f"{check.name}: baseline {check.baseline:.3f} m")
         table.add_column("interpretation of the poses")
         table.add_column("error of the warped view", justify="right")

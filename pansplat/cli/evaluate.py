@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pansplat.evaluation.lpips import Backbone, Lpips
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
 
 _WRITTEN = "results.json", "*/prediction.png", "*/target.png", "*/error.png"
 _HEIGHT = 512  # rows of the paper's panoramas
@@ -77,7 +77,7 @@ class Evaluate(Computation):
         lpips = choose_lpips(self.lpips, height)
         pairs = []
         for path in self.paths:
-            found = pipeline.load_pairs(path, **vars(self.reading))
+            found = pipeline.load_sets(path, **vars(self.reading))
             if self.leave_one_out:
                 with_targets = _leave_out_each(path, found)
             else:
@@ -105,10 +105,11 @@ class Evaluate(Computation):
         return 0
 
 
-def _leave_out_each(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
+def _leave_out_each(path: Path, pairs: Sequence[PanoramaSet]) -> list[PanoramaSet]:
     """A pair for each panorama of the tours of a folder that has others in its part; the rest are named."""
     from pansplat.tours.graph import find_tours
     from pansplat.tours.overlap import connect
+    from pansplat.tours.scene_views import leave_out
 
     tours = find_tours(pairs)
     if not tours:
@@ -122,7 +123,7 @@ def _leave_out_each(path: Path, pairs: Sequence[Pair]) -> list[Pair]:
         if alone:
             names = ", ".join(tour.panoramas[n].name for n in alone)
             print(f"note: {path}: not left out, because no other panorama shows the same: {names}", file=sys.stderr)
-        found += [tour.leave_out(n) for n in range(len(tour)) if n not in alone]
+        found += [leave_out(tour, n) for n in range(len(tour)) if n not in alone]
     return found
 
 

@@ -33,7 +33,7 @@ from pansplat.system.progress import stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
 
 _INDEX_NAME = "index.html"  # name of the page in a folder
 _MIN_GAUSSIANS, _GOOD_GAUSSIANS = 12_000, 20_000  # for each panorama: least without a note; suggested
@@ -166,7 +166,7 @@ class Page:
             serve_page(page)
 
 
-def _name_page(path: Path, photographs: Sequence[Pair]) -> str:
+def _name_page(path: Path, photographs: Sequence[PanoramaSet]) -> str:
     """The name of a tour by its author, else that of its folder or file."""
     from pansplat.inputs.web_tours import is_web_tour_file
 
@@ -196,7 +196,7 @@ class _TrainingSet:
         from pansplat.export.training_set import POINTS, write_dataset
         from pansplat.gaussians.ply import make_colors, save_points
         from pansplat.gaussians.scene import prune
-        from pansplat.inputs.pairs import Pair
+        from pansplat.inputs.panorama_sets import PanoramaSet
         from pansplat.inputs.reconstructions.nerfstudio import Z_UP
         from pansplat.system.atomic import replacing_folder
 
@@ -215,7 +215,7 @@ class _TrainingSet:
         if len(gaussians) > _MAX_POINTS:
             chosen = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]
             gaussians = gaussians.select(chosen.sort().values)
-        panoramas = source.context if isinstance(source, Pair) else source.panoramas
+        panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
         views = [
             dataclasses.replace(panorama, cam2world=pose)
             for panorama, pose in zip(panoramas, scene.frame.globalize(scene.cam2world), strict=True)
@@ -312,7 +312,7 @@ class Export(Computation):
         return 0
 
     @progress_bar()
-    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[Pair]]:
+    def open(self, *, joint: bool = False, gaussians: int | None = None) -> tuple[Scene, list[PanoramaSet]]:
         """The scene of the file, pair or tour as it is to be written, and its photographs.
 
         Args:

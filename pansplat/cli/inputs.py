@@ -22,7 +22,7 @@ from pansplat.system.progress import CONNECTED, POSED, stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
     from pansplat.tours.graph import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
@@ -74,18 +74,18 @@ class ScenePrediction:
     )
     choice: Annotated[PairChoice, arg(prefix_name=False)] = field(default_factory=PairChoice)
 
-    def open(self, path: Path) -> tuple[Scene, Pair | None]:
+    def open(self, path: Path) -> tuple[Scene, PanoramaSet | None]:
         """The scene of a scene file, or the prediction of a pair's folder, and the pair."""
         from pansplat import pipeline
 
         if is_scene_file(path):
             return pipeline.load(path), None
-        pair = choose_pair(path, self.choice)
+        pair = choose_set(path, self.choice)
         return predict_scene(pair, self.options), pair
 
     def open_panoramas(
         self, path: Path, gaussians: int | None = None, *, joint: bool = False
-    ) -> tuple[Scene, Pair | TourGraph]:
+    ) -> tuple[Scene, PanoramaSet | TourGraph]:
         """The scene of the chosen pair, or of the first tour of a folder, and its panoramas in the scene's order.
 
         Args:
@@ -100,7 +100,7 @@ class ScenePrediction:
         tours = [tour for tour in find_tours(pairs) if self.choice.pair in (None, tour.name)]
         options = replace(self.options, gaussians=gaussians, joint=joint)
         if not tours:
-            pair = pick_pair(path, pairs, self.choice)
+            pair = pick_set(path, pairs, self.choice)
             return predict_scene(pair, options), pair
         alone = sum(a == b for a, b in tours[0].overlaps)
         kinds = f"{len(tours[0]) - alone} placed, {alone} not placed; " if alone else ""
@@ -112,20 +112,20 @@ class ScenePrediction:
         return predict_scene(tour, options), tour
 
 
-def choose_pair(path: Path, choice: PairChoice) -> Pair:
+def choose_set(path: Path, choice: PairChoice) -> PanoramaSet:
     """The chosen pair of a folder; without a choice the first one, with a note if there are more."""
-    return pick_pair(path, load_choice(path, choice), choice)
+    return pick_set(path, load_choice(path, choice), choice)
 
 
-def load_choice(path: Path, choice: PairChoice) -> list[Pair]:
+def load_choice(path: Path, choice: PairChoice) -> list[PanoramaSet]:
     """The pairs of a folder."""
     from pansplat import pipeline
 
     with stage(POSED):
-        return pipeline.load_pairs(path, **vars(choice.reading))
+        return pipeline.load_sets(path, **vars(choice.reading))
 
 
-def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
+def pick_set(path: Path, pairs: list[PanoramaSet], choice: PairChoice) -> PanoramaSet:
     """The chosen one of the pairs of a folder; without a choice the first one, with a note if there are more."""
     names = [pair.name for pair in pairs]
     listed = ", ".join(f"{number}: {name}" for number, name in enumerate(names, 1))
@@ -141,14 +141,14 @@ def pick_pair(path: Path, pairs: list[Pair], choice: PairChoice) -> Pair:
     raise InputError(f"--pair {choice.pair}: {path} holds {listed}")
 
 
-def predict_scene(source: Pair | TourGraph, options: PredictOptions) -> Scene:
+def predict_scene(source: PanoramaSet | TourGraph, options: PredictOptions) -> Scene:
     """Predict and refine the scene of a pair or tour; networks draw layers jointly."""
     from pansplat import pipeline
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
 
     model = pipeline.load_predictor(options)
     options = replace(options, joint=options.joint and not pipeline.can_stream(model))
-    if isinstance(source, Pair):
+    if isinstance(source, PanoramaSet):
         return pipeline.predict(source, model, options=options)
     return pipeline.predict_tour(source, model, options=options)
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Computation, Out, PairChoice, choose_pair
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_set
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.files import SCENE_SUFFIXES, require_output_file
@@ -42,7 +42,7 @@ class Predict(Computation):
         from pansplat import pipeline
 
         require_output_file("--out", self.out, SCENE_SUFFIXES, overwrite=self.overwrite)
-        pair = choose_pair(self.path, self.choice)
+        pair = choose_set(self.path, self.choice)
         model = pipeline.load_predictor(self.prediction)
         joint = not self.layers and len(pair.context) > 1 and not pipeline.can_stream(model)
         options = replace(self.prediction, joint=joint)

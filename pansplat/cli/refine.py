@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Fixed, Positional, Suppress
 
-from pansplat.cli.inputs import Computation, Out, PairChoice, choose_pair, predict_scene
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_set, predict_scene
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import call_at_first_signal, progress_bar
@@ -107,9 +107,9 @@ class Refine(Computation):
 
         if self.photographs is not None:
             scene = pipeline.load(self.path)
-            pair = choose_pair(self.photographs, self.choice)
+            pair = choose_set(self.photographs, self.choice)
             return scene, pipeline.load_photographs(pair, self.prediction.height or scene.height)
-        pair = choose_pair(self.path, self.choice)
+        pair = choose_set(self.path, self.choice)
         scene = predict_scene(pair, self.prediction)
         return scene, pipeline.load_photographs(pair, scene.height)
 

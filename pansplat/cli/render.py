@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from pansplat.export.film import Film, Shot
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair
+    from pansplat.inputs.panorama_sets import PanoramaSet
     from pansplat.rendering import Rendering
     from pansplat.tours.camera_path import CameraPath
     from pansplat.tours.route import Route
@@ -164,16 +164,16 @@ class Render(Computation):
         """The frames of a film: of a path, or of the flight through all input cameras."""
         from pansplat.export.film import follow_path, list_flight
         from pansplat.geometry.path import fly_pose
-        from pansplat.tours.graph import make_graph
+        from pansplat.tours.merge import make_graph
 
         if path is not None:
-            return follow_path(path, self.fps, scene, make_graph(scene) if scene.overlaps else None)
+            return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
         flight = _plan_route(scene) or (lambda fraction: fly_pose(scene.cam2world, fraction).numpy())
         return list_flight(flight, self.fps, self.fov, self.seconds)
 
-    def _make_film(self, scene: Scene, source: Pair | None, options: dict[str, Any], count: int) -> Film:
+    def _make_film(self, scene: Scene, source: PanoramaSet | None, options: dict[str, Any], count: int) -> Film:
         """Draws the scene, and photographs that no option replaces; `count` is the number of frames."""
         import functools
 
@@ -185,7 +185,7 @@ class Render(Computation):
         from pansplat.tours.route import NEAR_OF_FAR
 
         is_perspective = options["layout"] == "pinhole"
-        near = NEAR_OF_FAR * scene.far if scene.overlaps else NEAR
+        near = NEAR_OF_FAR * scene.far if scene.tour else NEAR
 
         @functools.lru_cache(maxsize=2)
         def renderer(shown: Scene) -> Callable[..., Rendering]:
@@ -205,13 +205,14 @@ class Render(Computation):
 
 def _plan_route(scene: Scene) -> Route | None:
     """The way through a tour; None for another scene."""
-    from pansplat.tours.graph import make_graph
+    from pansplat.tours.facts import TourFacts
     from pansplat.tours.route import REST_SECONDS, plan_route
+    from pansplat.tours.walks import plan_walk
 
-    if not scene.overlaps:
+    if scene.tour is None:
         return None
-    tour = make_graph(scene)
-    return plan_route(tour, tour.plan_walk(), rest=REST_SECONDS)
+    facts = TourFacts(scene)
+    return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
 def read_pose(path: Path) -> Tensor:

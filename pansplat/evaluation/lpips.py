@@ -80,7 +80,7 @@ class Lpips(nn.Module):
 
         Args:
             prediction, target: RGB in [0, 1]; values outside are not clamped.
-            weights: of the pixels; by default equal. The prediction is not used at pixels of weight 0.
+            weights: one for each pixel; by default equal. The prediction is not used at pixels of weight 0.
         """
         if min(target.shape[-2:]) < MIN_IMAGE_SIZE:
             size = "x".join(str(side) for side in target.shape[-2:])
@@ -256,7 +256,6 @@ _CLASSIFIERS: dict[Backbone, str] = {
     "alex": "alexnet-owt-7be5be79.pth",
     "squeeze": "squeezenet1_1-b8a52dc0.pth",
 }
-_PATTERNS: dict[Backbone, str] = {"vgg": "vgg16*.pth", "alex": "alexnet*.pth", "squeeze": "squeezenet1_1*.pth"}
 _CLASSIFIER_SITE = "https://download.pytorch.org/models/"
 _HEAD_FOLDERS = (".", "lpips_heads", "lpips", "v0.1")  # inside a folder of weights
 _HEAD_SITE = "https://github.com/richzhang/PerceptualSimilarity/tree/master/lpips/weights/v0.1"
@@ -287,7 +286,8 @@ def find_backbone(folder: Path | None = None) -> Backbone | None:
 
 def find_classifier(backbone: Backbone, folder: Path | None = None) -> Path | None:
     """The file of torchvision's classifier, by its name or a name with the same beginning."""
-    found = (path for candidate in _list_folders(folder) for path in sorted(candidate.glob(_PATTERNS[backbone])))
+    pattern = f"{_CLASSIFIERS[backbone].partition('-')[0]}*.pth"
+    found = (path for candidate in _list_folders(folder) for path in sorted(candidate.glob(pattern)))
     return next(found, None)
 
 

@@ -23,16 +23,10 @@ _SSIM_SIGMA = 1.5  # pixels
 _SSIM_RADIUS = 5  # pixels: an 11 x 11 window
 
 
-def psnr(
-    prediction: Float[Tensor, "3 height width"],
-    target: Float[Tensor, "3 height width"],
-    *,
-    mask: Bool[Tensor, "height width"] | None = None,
-) -> float:
+def psnr(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]) -> float:
     """Peak signal-to-noise ratio in dB, both images clamped to [0, 1]; infinite when they are equal."""
-    _check_shapes(prediction, target, mask)
-    error = (prediction.double().clamp(0, 1) - target.double().clamp(0, 1)).square().mean(0)
-    return _to_decibels(_weighted_mean(error, torch.ones_like(error), mask))
+    _check_shapes(prediction, target)
+    return _to_decibels(float((prediction.double().clamp(0, 1) - target.double().clamp(0, 1)).square().mean()))
 
 
 def ws_psnr(
@@ -48,7 +42,9 @@ def ws_psnr(
     _check_shapes(prediction, target, mask)
     error = (prediction.double() - target.double()).square().mean(0)
     weights = row_weights(error.shape[0]).to(error.device)[:, None].expand_as(error)
-    return _to_decibels(_weighted_mean(error, weights, mask))
+    weights = weights if mask is None else weights * mask
+    total = float(weights.sum())
+    return _to_decibels(float((error * weights).sum()) / total if total > 0 else math.nan)
 
 
 def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 height width"]) -> float:
@@ -57,7 +53,7 @@ def ssim(prediction: Float[Tensor, "3 height width"], target: Float[Tensor, "3 h
     Source: Wang et al., doi:10.1109/TIP.2003.819861, with the settings of the official protocol: 11 x 11
     window of sigma 1.5, K = (0.01, 0.03), data range 1, only windows inside the image.
     """
-    _check_shapes(prediction, target, None)
+    _check_shapes(prediction, target)
     if min(prediction.shape[-2:]) <= 2 * _SSIM_RADIUS:
         raise ValueError(f"`prediction` must be larger than 10 x 10 pixels, got {tuple(prediction.shape[-2:])}")
     a, b = (image.detach().cpu().double().numpy() for image in (prediction, target))
@@ -83,18 +79,11 @@ def _average_windows(image: np.ndarray) -> np.ndarray:
     return scipy.ndimage.correlate1d(columns, kernel, axis=2)[:, inside, inside]
 
 
-def _weighted_mean(error: Tensor, weights: Tensor, mask: Tensor | None) -> float:
-    if mask is not None:
-        weights = weights * mask
-    total = float(weights.sum())
-    return float((error * weights).sum()) / total if total > 0 else math.nan
-
-
 def _to_decibels(mean_square: float) -> float:
     return -10 * math.log10(mean_square) if mean_square > 0 else (math.inf if mean_square == 0 else math.nan)
 
 
-def _check_shapes(prediction: Tensor, target: Tensor, mask: Tensor | None) -> None:
+def _check_shapes(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
     if prediction.shape != target.shape or prediction.ndim != 3:
         shapes = f"{tuple(prediction.shape)} and {tuple(target.shape)}"
         raise ValueError(f"`prediction` and `target` must both be (3, height, width), got {shapes}")
@@ -122,7 +111,7 @@ def distortion(
     They are from 0 to 1, NaN if nothing counts.
 
     Args:
-        inverse_depth: of the surface, radial; NaN where there is none: pixels beside these do not count.
+        inverse_depth: 1 / radial distance of the surface; NaN where there is none: pixels beside these do not count.
         offset, ahead: place of the moved camera, and direction of the flight, in the view's axes.
     """
     height, width = inverse_depth.shape

@@ -19,7 +19,7 @@ from torch import Tensor
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pad_equirect, pixel_directions, row_weights, uv_from_directions
 from pansplat.geometry.pose import invert_pose
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Views
 
 AS_GIVEN = "as given"
@@ -70,7 +70,7 @@ class PoseCheck:
     """The result of a pose check.
 
     Attributes:
-        name: of the pair.
+        name: the pair's.
         baseline: largest distance between context cameras, metres.
         error: photometric error of the warp with the poses as given: 0 for a perfect fit, about 1 for unrelated images.
         errors: the error for each interpretation of the poses, best first; `AS_GIVEN` is one.
@@ -95,7 +95,7 @@ class PoseCheck:
         return tuple(r for r, error in self.errors.items() if r != AS_GIVEN and error <= _SIMILAR_RATIO * self.error)
 
 
-def check_pair(pair: Pair) -> PoseCheck:
+def check_pair(pair: PanoramaSet) -> PoseCheck:
     """Check the poses of a pair's context views against their images; takes seconds."""
     if len(pair.context) < 2:
         raise InputError(

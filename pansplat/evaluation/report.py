@@ -6,7 +6,6 @@ Source: PanSplat, section 4 (metrics of the views between the inputs).
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -26,12 +25,13 @@ from pansplat.evaluation.metrics import cross_fade, distortion, psnr, ssim, ws_p
 from pansplat.evaluation.results import Column, Row, average_rows, make_folder, rich_table, write_json
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.pipeline import Drawing
 from pansplat.predictor import Predictor
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, OPAQUE
 from pansplat.rendering import Rendering, rasterize
+from pansplat.system.files import make_portable_name, make_unique_name
 from pansplat.system.progress import report_progress, stage
 
 _CROSS_FADE = {  # metrics of the cross-fade, by those of the prediction
@@ -43,7 +43,7 @@ ERROR_SCALE = 0.25  # mean absolute colour error that the brightest colour of an
 
 
 def evaluate(
-    pairs: Sequence[Pair],
+    pairs: Sequence[PanoramaSet],
     predictor: Predictor,
     out: Path,
     *,
@@ -63,7 +63,7 @@ def evaluate(
     results.json is written after each pair, so that an interruption keeps the results so far.
 
     Args:
-        refine_steps: of the refinement of each scene; 0 for none.
+        refine_steps: steps of the refinement of each scene; 0 for none.
         blend, drawing: see `pipeline.render`. With "joint", scenes are fused (`fuse_views`), but those of networks are
             not: these are trained for joint drawing.
     """
@@ -93,7 +93,7 @@ def warm_up(predictor: Predictor) -> None:
 
 
 def _evaluate_pair(
-    pair: Pair,
+    pair: PanoramaSet,
     predictor: Predictor,
     out: Path,
     taken: set[str],
@@ -122,7 +122,8 @@ def _evaluate_pair(
             image = render(pose).color.float()
         render_seconds = time.perf_counter() - start
         name = pair.name if len(targets.images) == 1 else f"{pair.name} {Path(targets.names[view]).stem}"
-        folder = out / _choose_folder_name(name, taken)
+        folder = out / make_unique_name(make_portable_name(name) or "case", taken)
+        taken.add(folder.name)
         make_folder(folder)
         write_image(folder / "prediction.png", image)
         write_image(folder / "target.png", target)
@@ -238,13 +239,3 @@ def results_table(rows: Sequence[Row]) -> Table:
     below = [Row({"name": "mean"}, mean.values)] if len(rows) > 1 else []
     title = "{model}, {height}x{width}".format(**rows[0].case, width=2 * rows[0].case["height"])
     return rich_table(title, columns, rows, [*below, Row({"name": "cross-fade"}, faded)])
-
-
-def _choose_folder_name(name: str, taken: set[str]) -> str:
-    """The name as a valid folder name, numbered if another case has it."""
-    base = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "case"
-    free, number = base, 2
-    while free in taken:
-        free, number = f"{base}-{number}", number + 1
-    taken.add(free)
-    return free

@@ -31,26 +31,26 @@ from pansplat import pipeline
 from pansplat.export.photographs import read_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, are_seen, measure_reach
 from pansplat.tours.doll_house import Rooms
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
-_TOP = 0.94  # of the ceiling's height over the cameras: height of the walls
-_DOOR, _PARALLEL = 0.6, 0.9  # of the same: height of doors, below the band of walls; cosine between a door and its wall
+_TOP, _DOOR = 0.94, 0.6  # heights of walls and doors over the cameras, as shares of the ceiling's height there
+_PARALLEL = 0.9  # least cosine between a door and its wall
 _BEHIND = 0.4  # farthest room behind a door, and distance of the two sides of a wall
-_THICK = 0.07  # of the walls, seen from above
+_THICK = 0.07  # thickness of the walls, seen from above
 _STEP = 0.06  # between two places where cameras are compared
-_SOFT, _WIDE = 1.0, 4.0  # of these places: where one camera replaces another; over which hidden ones are averaged
-_TRIPOD = 0.35  # radius of the floor around a camera, which its photograph does not show
-_EDGE, _EDGE_SOFT = 0.05, 0.03  # of a wall's width beside an unseen wall; of its height over which colours are averaged
+_SOFT, _WIDE = 1.0, 4.0  # widths in such steps: of the border of two cameras; over which hidden places are averaged
+_TRIPOD = 0.42  # radius of the floor around a camera, which its photograph does not show
+_EDGE, _EDGE_SOFT = 0.05, 0.03  # shares of the width and the height of a wall whose colours go on beside it
 _GRAZING, _ASIDE = 0.02, 0.05  # least cosine between a ray and the normal of a surface; from a wall to where it is seen
-_THROUGH, _OPEN = 1.3, 0.6  # of the distance of a wall that a camera sees through; share of its places
+_THROUGH, _OPEN = 1.3, 0.6  # an open wall: the camera sees to this factor of its distance, at this share of its places
 _HIDDEN = 4.0  # factor of the distance of a camera whose surfaces are in front
 _ATLAS, _MARGIN = 2048, 4  # side of the atlas, and space around each texture, texels
 _FINEST = 150.0  # texels along a camera's height
-_REACH_ROWS, _PHOTO_ROWS = 256, 1024  # of the surfaces and the photographs
-_QUALITY, _KEPT = 80, 16  # of WebP; photographs in memory
+_REACH_ROWS, _PHOTO_ROWS = 256, 1024  # rows of the images of surfaces, and of the photographs
+_QUALITY, _KEPT = 80, 16  # quality of WebP; number of photographs in memory
 
 Gap = tuple[int, Polygon, Float[np.ndarray, "2"], float]
 """A room with a gap to another one, the ground between them, the direction of the wall, and the upper edge."""
@@ -106,9 +106,9 @@ def build_panels(rooms: Rooms, is_open: Callable[[int, np.ndarray, float], bool]
         is_open: whether the cameras of a room see through a wall of it that is on the floor at a height (downwards).
     """
     panels: list[Panel] = []
-    down = rooms.positions @ rooms.level[:, 1]
+    down = rooms.eyes[:, 1]
     for house, views in enumerate(rooms.houses):
-        shapes = {number: shape for number, (nodes, shape) in enumerate(rooms.outlines) if nodes[0] in views}
+        shapes = {number: room.shape for number, room in enumerate(rooms.plan.rooms) if room.panoramas[0] in views}
         chosen = list(views)
         unit, ceiling = float(np.median(rooms.floors[chosen])), float(np.median(rooms.ceilings[chosen]))
         eye, floor = float(np.median(down[chosen])), float(np.median((down + rooms.floors)[chosen]))
@@ -194,7 +194,7 @@ def _raise_walls(
 
 
 @torch.no_grad()
-def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[Pair] = ()) -> DollHouse:
+def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet] = ()) -> DollHouse:
     """The doll's houses of a scene.
 
     Args:
@@ -242,7 +242,7 @@ def _list_nodes(rooms: Rooms, host: int) -> dict[int, tuple[float, Float[np.ndar
     for house in np.flatnonzero(np.array(rooms.hosts) == host).tolist():
         for view in rooms.houses[house]:
             turn = 0.0 if house == host else rooms.plan.drawn[view].turn or 0.0
-            found[view] = turn, rooms.level @ rooms.show(house, rooms.positions[view] @ rooms.level)
+            found[view] = turn, rooms.level @ rooms.show(house, rooms.eyes[view])
     return dict(sorted(found.items()))
 
 
@@ -308,7 +308,7 @@ def _pack(panels: Sequence[Panel], density: float) -> tuple[float, Int[np.ndarra
 class _Painter:
     """Projects photographs on panels."""
 
-    def __init__(self, scene: Scene, rooms: Rooms, photographs: Sequence[Pair]) -> None:
+    def __init__(self, scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet]) -> None:
         self.rooms, self.poses, self.level = rooms, scene.cam2world.double().cpu(), torch.from_numpy(rooms.level)
 
         @functools.lru_cache(maxsize=_KEPT)
@@ -325,11 +325,11 @@ class _Painter:
             if not scene.joint:
                 own &= scene.gaussians.views == view
             self.reaches.append(measure_reach(scene.gaussians.select(own), pose, _REACH_ROWS).cpu())
-        self.eyes = rooms.positions @ rooms.level
+        self.eyes = rooms.eyes
 
     def is_open(self, room: int, wall: Float[np.ndarray, "2 2"], floor: float) -> bool:
         """Whether the nearest camera of a room sees through a wall, which is open then, or a window."""
-        views, (start, end) = self.rooms.outlines[room][0], wall
+        views, (start, end) = self.rooms.plan.rooms[room].panoramas, wall
         view = min(views, key=lambda view: np.linalg.norm(self.eyes[view][[0, 2]] - (start + end) / 2))
         shares, heights = np.meshgrid(np.linspace(0.1, 0.9, 9), np.linspace(0, 0.8, 5))
         flat = start + shares.reshape(-1, 1) * (end - start)
@@ -367,17 +367,22 @@ class _Painter:
         self, panel: Panel, grid: Float[np.ndarray, "h w 2"], view: int, unit: float
     ) -> Float[np.ndarray, "h w"]:
         """How badly a camera shows places of a panel: its distance, more where something is in front; inf if unseen."""
-        views, outline = self.rooms.outlines[panel.room]
+        room = self.rooms.plan.rooms[panel.room]
         places, normal = panel.locate(grid), np.cross(panel.down, panel.right)  # into the room
         offsets = places - self.eyes[view]
         distance = np.linalg.norm(offsets, axis=-1)
         world = torch.from_numpy(places.reshape(-1, 3)) @ self.level.T
         is_shown = are_seen(world, self.poses[view], self.reaches[view]).numpy().reshape(distance.shape)
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
-        is_below = (np.hypot(offsets[..., 0], offsets[..., 2]) < _TRIPOD * unit) & (offsets[..., 1] > 0.5 * unit)
+        house = list(self.rooms.houses[panel.house])
+        aside = np.linalg.norm((places[..., None, :] - self.eyes[house])[..., (0, 2)], axis=-1)
+        is_under = (aside < _TRIPOD * unit) & (offsets[..., 1:2] > 0.5 * unit)  # of each camera
         cost = distance * (1 + (_HIDDEN - 1) * (1 - clear))
-        is_seen = (-(offsets @ normal) > _GRAZING * distance) & (is_shown | (view in views)) & ~is_below
+        # What stands before a tripod does not replace it.
+        is_seen = is_shown | ((view in room.panoramas) & ~is_under.any(axis=-1))
+        is_seen &= (-(offsets @ normal) > _GRAZING * distance) & ~is_under[..., house.index(view)]
         ahead = shapely.Point(self.eyes[view][[0, 2]])
+        outline = room.shape
         if outline.contains(ahead) and outline.area < 0.999 * outline.convex_hull.area:
             flat = (places + _ASIDE * unit * normal)[..., (0, 2)][is_seen]
             ways = shapely.linestrings(np.stack(np.broadcast_arrays(flat, self.eyes[view][[0, 2]]), axis=-2))

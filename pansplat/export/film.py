@@ -22,13 +22,16 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import level_axes
 from pansplat.images.panorama_metadata import Stereo
 from pansplat.images.video import write_video
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.rendering.image_planes import ImagePlane, Layout, image_planes
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
-from pansplat.tours.graph import Edge, TourGraph, make_graph, select_views
+from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.limits import follow_edge
+from pansplat.tours.merge import make_graph, select_views
 from pansplat.tours.route import STOP_REACH, STOP_SECONDS, Moment, Route, find_offset
+from pansplat.tours.scene_views import choose_scene_views
 
 FLIGHT_SECONDS = 4.0  # of the film of a pair
 _HEIGHTS = (512, 1024, 2048, 4096)  # of photographs in memory, pixels; the least that is as dense as the frame
@@ -46,7 +49,7 @@ class FilmPhotographs:
 
     def __init__(
         self,
-        photographs: Sequence[Pair],
+        photographs: Sequence[PanoramaSet],
         cam2world: Float[Tensor, "photograph 4 4"],
         gains: Sequence[tuple[float, ...]] = (),
     ) -> None:
@@ -71,9 +74,9 @@ class FilmPhotographs:
         self._load = load
 
     @staticmethod
-    def open(source: Pair | TourGraph, scene: Scene) -> FilmPhotographs:
+    def open(source: PanoramaSet | TourGraph, scene: Scene) -> FilmPhotographs:
         """The photographs that a scene, or all scenes of a tour, are predicted from."""
-        panoramas = source.context if isinstance(source, Pair) else source.panoramas
+        panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
         poses = torch.stack([panorama.cam2world for panorama in panoramas])
         gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
         return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
@@ -198,7 +201,7 @@ def follow_path(path: CameraPath, fps: float, scene: Scene, tour: TourGraph | No
 
 def choose_scenes(scene: Scene) -> Callable[[Shot], tuple[Scene, int]]:
     """What the frames of a film show of a scene, and its part: all, or of a tour the scene of the camera's edge."""
-    if not scene.overlaps:
+    if scene.tour is None:
         return lambda shot: (scene, 0)
     tour, edge = make_graph(scene), None
     select = functools.lru_cache(maxsize=4)(functools.partial(select_views, scene))
@@ -206,10 +209,10 @@ def choose_scenes(scene: Scene) -> Callable[[Shot], tuple[Scene, int]]:
     def choose(shot: Shot) -> tuple[Scene, int]:
         nonlocal edge
         place = shot.pose[:3, 3]
-        followed = tour.find_nearest_edge(place)[0] if edge is None else tour.follow_edge(place, edge)
+        followed = tour.find_nearest_edge(place)[0] if edge is None else follow_edge(tour, place, edge)
         edge = shot.edge or followed
         part = tour.parts[edge[0]]
-        return select(tour.list_parts()[part] if scene.joint else tour.choose_scene_views()[edge]), part
+        return select(tour.list_parts()[part] if scene.joint else choose_scene_views(tour)[edge]), part
 
     return choose
 

@@ -46,7 +46,7 @@ from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_file
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.path import find_direction, turn_axes
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Views
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement
 from pansplat.rendering.color_fit import fit_colors
@@ -59,33 +59,35 @@ from pansplat.system.files import SOFTWARE, is_written
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.graph import EDGE_HYSTERESIS, Edge, TourGraph, select_views
+from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, link_parts
-from pansplat.tours.outlook import find_widest
+from pansplat.tours.merge import select_views
+from pansplat.tours.outlook import find_turns, find_widest
 from pansplat.tours.route import find_angles, find_start_angles
+from pansplat.tours.scene_views import choose_scene_views
+from pansplat.tours.walks import find_next_nodes, plan_walk
 
-DEFAULT_GAUSSIANS = 600_000  # pages of about 13 MB
-PHOTO_GAUSSIANS = 450_000  # the same of a page with photographs, about 10 MB
+DEFAULT_GAUSSIANS = 600_000  # make a page of about 13 MB
+PHOTO_GAUSSIANS = 450_000  # make one of about 10 MB, to which photographs are added
 MAX_GAUSSIANS = 4_000_000  # fit textures of 2048 texels a side, which every device has
-MAX_FILE_BYTES = 64_000_000  # of a page in one file
-_TARGET_BYTES = 15_000_000  # harmonics of higher degree are left out of larger pages, and photographs are smaller
-_GAUSSIANS_SHARE = 1 / 2  # of it, beside photographs
-_SEEN_SHARE = 2 / 3  # of the Gaussians of a panorama, beside photographs that need the bytes
-_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # of a page: a Gaussian, and a photograph as a fraction of its squared rows
-_PROGRAM_BYTES = 200_000  # of a page without its data
-_PART_BYTES = 1_500_000  # of the data between two steps of the progress bar; divisible by 3
-_FIT_STEPS = 8  # of merged Gaussians to the images of all Gaussians
-_START_FOV = 75.0  # degrees, vertical, of a landscape image
+MAX_FILE_BYTES = 64_000_000  # largest page in one file
+_TARGET_BYTES = 15_000_000  # in larger pages harmonics of higher degree are left out, and photographs are smaller
+_GAUSSIANS_SHARE = 1 / 2  # part of the target for Gaussians, where there are photographs
+_SEEN_SHARE = 2 / 3  # part of the Gaussians that is kept where photographs need the bytes
+_GAUSSIAN_BYTES, _PHOTO_BYTES = 22, 0.45  # size in a page: of a Gaussian, and of a photograph as a factor of its rows^2
+_PROGRAM_BYTES = 200_000  # size of a page without its data
+_PART_BYTES = 1_500_000  # size of the data between two steps of the progress bar; divisible by 3
+_FIT_STEPS = 8  # steps of the fit of merged Gaussians to the images of all
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
-_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "size": (1.0, 1.0), "places": ()}
+_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
 _SHADERS |= {"photograph": ("screen.vert", "photograph.frag"), "house": ("house.vert", "house.frag")}
 
 _WORKER = ("unpack.js", "sorter.js")
-_LIBRARIES = ("graph.js", "renderer.js")  # which know nothing of the page; scripts of their own
+_LIBRARIES = ("graph.js", "renderer.js")  # scripts of their own, which know nothing of the page
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./(\w+\.js)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
@@ -122,7 +124,7 @@ def write_page(
     split: bool = False,
     title: str | None = None,
     address: str | None = None,
-    photographs: Sequence[Pair] = (),
+    photographs: Sequence[PanoramaSet] = (),
     photo_height: int | None = None,
 ) -> PageFiles:
     """Write a scene as a web page.
@@ -138,29 +140,27 @@ def write_page(
         address: of the page on the web, for previews of links to it. They show the poster of a split page.
         photographs: of each view, which the page shows there (`list_photographs`), with the notes of its
             tour; none without them.
-        photo_height: their largest height, pixels, 0 for none; by default what fits, if it is split that of the files.
+        photo_height: largest height of photographs, pixels, 0 for none; by default what fits, in a split page that
+            of the files.
     """
     path = Path(path)
     if not 1 <= gaussians <= MAX_GAUSSIANS:
         raise InputError(f"`gaussians` must be 1 to {MAX_GAUSSIANS:,} in a page, got {gaussians:,}")
     report_progress("checking the scene", 0.0)
-    if scene.joint and scene.overlaps:
+    if scene.joint and scene.tour:
         warnings.warn(
             "a page follows the edges of a tour with all Gaussians of each panorama, got each surface once; its "
             "flights are straight. Export the folder of the photographs, or a scene file of --layers.",
             InputWarning,
             stacklevel=2,
         )
-        scene = dataclasses.replace(scene, overlaps=(), links=(), starts=(), approximate=())
+        scene = dataclasses.replace(scene, starts=(), tour=None)
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
-    facts = TourFacts(
-        scene if has_cameras else prepared,
-        folder=photographs[0].folder if photographs else None,
-    )
+    facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
     tour = dataclasses.replace(facts.tour, poor=facts.poor)
     rooms = find_rooms(facts) if has_cameras else None
     scene = prepared
-    flights = _plan_flights(scene, tour, facts)
+    flights = _plan_flights(tour, len(scene.cam2world))
     house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
@@ -180,7 +180,10 @@ def write_page(
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree)
     report_progress("drawing the poster", 0.7)
-    poster = _draw_poster(scene, flights.start, photographs if has_pictures else ())
+    first = flights.walk[0]
+    start = scene.cam2world[first].clone()
+    start[:3, :3] = torch.from_numpy(turn_axes(tour.level_axes, *_find_ahead(tour, facts, first)))
+    poster = _draw_poster(scene, start, photographs if has_pictures else ())
     pictures: list[PackedPhotograph] = []
     if has_pictures:
         left = 0.75 * (_TARGET_BYTES - _PROGRAM_BYTES) - sum(map(len, packed.contents)) - len(poster + house.atlas)
@@ -191,14 +194,9 @@ def write_page(
     header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
     header["plan"] = _describe_plan(facts) if has_cameras else _NO_PLAN
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
-        spot["notes"] = [
-            {
-                "direction": _round(find_direction(pose, note.yaw, note.pitch).numpy()),
-                "text": note.text,
-                "addresses": note.addresses,
-            }
-            for note in photograph.context[0].notes
-        ]
+        for note in photograph.context[0].notes:
+            direction = _round(find_direction(pose, note.yaw, note.pitch).numpy())
+            spot["notes"].append({"direction": direction, "text": note.text, "addresses": note.addresses})
     for nodes, corners in zip(house.nodes, house.corners, strict=True):
         moves = [(turn, *_round(place - origin)) for turn, place in nodes.values()]
         corners = (corners - [*origin, 0, 0]).round(5).tolist()
@@ -214,57 +212,32 @@ class _Flights:
     """How the camera moves.
 
     Attributes:
-        start: first pose, without roll.
-        level: axes of a level camera (columns right, down, forward); yaws are relative to it.
-        yaw, pitch: of the start, radians.
         parts: of each view; the camera moves within a part, and the image fades to another one.
         groups: views that are blended together.
         edges: two views and the group that is blended between them; without edges all views are blended.
-        next: the next panorama on the way from a panorama (row) to another one (column).
         walk: all views, in the order of a visit.
-        hysteresis: distance by which another edge must be nearer than the current one.
     """
 
-    start: Float[Tensor, "4 4"]
-    level: Float[np.ndarray, "3 3"]
-    yaw: float
-    pitch: float
     parts: tuple[int, ...]
     groups: tuple[tuple[int, ...], ...]
+    edges: tuple[tuple[int, int, int], ...]
     walk: tuple[int, ...]
-    edges: tuple[tuple[int, int, int], ...] = ()
-    next: tuple[tuple[int, ...], ...] = ()
-    hysteresis: float = 0.0
 
 
-def _plan_flights(scene: Scene, tour: TourGraph, facts: TourFacts) -> _Flights:
+def _plan_flights(tour: TourGraph, count: int) -> _Flights:
     """The flights of a tour; without edges, the camera flies from view to view.
 
     Args:
-        scene: of `_prepare`.
-        tour, facts: of the scene before.
+        tour: of the scene.
+        count: number of views.
     """
-    views = tuple(range(len(scene.cam2world)))
-    walk = tuple(dict.fromkeys(tour.plan_walk())) if tour.overlaps else views
-    start, level = scene.cam2world[walk[0]].clone(), tour.level_axes
-    yaw, pitch = _find_ahead(tour, facts, walk[0])
-    start[:3, :3] = torch.from_numpy(turn_axes(level, yaw, pitch))
     if not tour.overlaps:
-        return _Flights(start, level, yaw, pitch, (0,) * len(views), (views,), walk)
-    scenes = tour.choose_scene_views()
+        views = tuple(range(count))
+        return _Flights((0,) * count, (views,), (), views)
+    scenes = choose_scene_views(tour)
     groups = tuple(dict.fromkeys(scenes.values()))
-    return _Flights(
-        start,
-        level,
-        yaw,
-        pitch,
-        tour.parts,
-        groups,
-        walk,
-        tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps),
-        tuple(tuple(row) for row in tour.find_next_nodes()),
-        EDGE_HYSTERESIS,
-    )
+    edges = tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps)
+    return _Flights(tour.parts, groups, edges, tuple(dict.fromkeys(plan_walk(tour))))
 
 
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
@@ -274,9 +247,9 @@ def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, fl
 
 def _order_views(scene: Scene, flights: _Flights) -> list[int]:
     """The views of the part where the page starts, then the others; the nearest first."""
-    distances = (scene.cam2world[:, :3, 3] - flights.start[:3, 3]).norm(dim=1).numpy()
-    parts = np.array(flights.parts)
-    return np.lexsort((distances, parts != parts[distances.argmin()])).tolist()
+    first, parts = flights.walk[0], np.array(flights.parts)
+    distances = (scene.cam2world[:, :3, 3] - scene.cam2world[first, :3, 3]).norm(dim=1).numpy()
+    return np.lexsort((distances, parts != parts[first])).tolist()
 
 
 def _prepare(scene: Scene) -> Scene:
@@ -373,9 +346,10 @@ def _choose_degree(scene: Scene, num_bytes: float) -> int:
     return next((degree for degree in degrees if count_bytes(count, degree) * 4 / 3 <= num_bytes), 0)
 
 
-def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[Pair]) -> bytes:
+def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[PanoramaSet]) -> bytes:
     """A JPEG of the first view of the page; at a panorama it shows the photograph, if there is one."""
-    fov = math.degrees(2 * math.atan(PageConstants().tallest * math.tan(math.radians(_START_FOV / 2))))
+    shared = PageConstants()
+    fov = math.degrees(2 * math.atan(shared.tallest * math.tan(math.radians(shared.start_fov / 2))))
 
     def draw() -> Float[np.ndarray, "height width 3"]:
         options = {"size": _POSTER_SIZE, "layout": "pinhole", "vertical_fov_degrees": fov}
@@ -405,49 +379,38 @@ def _describe_scene(
         scene: of `_prepare`, with all Gaussians.
         flown: parts whose Gaussians are in the page.
     """
-    level = flights.level
+    level = tour.level_axes
     positions = scene.cam2world[:, :3, 3].numpy() - origin
-    heights = facts.usual_heights
-    marks = positions + np.outer(heights, level[:, 1])
+    marks = positions + np.outer(facts.usual_heights, level[:, 1])
     spots = [
         {
             "name": name,
             "position": _round(position),
             "mark": _round(mark),
             "notes": [],
-            "ahead": _round(np.array(_find_ahead(tour, facts, view))),
+            "ahead": [round(angle, 5) for angle in _find_ahead(tour, facts, view)],
             "hasStart": tour.panoramas[view].start is not None,
+            "turns": _round(find_turns(facts.outlooks[view])),
             "hidden": facts.hidden[view],
             "clearances": facts.clearances[view].round(2).tolist(),
         }
         for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True))
     ]
     reaches = _measure_reaches(scene, np.array(flights.parts))
-    views_of_page = [
-        {"position": _round(position), "start": start, "count": count}
-        for position, start, count in zip(positions, packed.starts, packed.counts, strict=True)
-    ]
     return {
         "count": sum(packed.counts),
         "degree": packed.degree,
         "colorRange": packed.color_range,
         "harmonicsScale": packed.harmonics_scale,
-        "views": views_of_page,
+        "views": [{"start": each, "count": n} for each, n in zip(packed.starts, packed.counts, strict=True)],
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), spots, heights, facts.outlooks) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), spots, facts) if flights.edges else [],
         "level": [_round(row) for row in level],
-        "start": {
-            "position": _round(flights.start[:3, 3].numpy() - origin),
-            "yaw": round(flights.yaw, 5),
-            "pitch": round(flights.pitch, 5),
-            "fov": _START_FOV,
-        },
         "parts": flights.parts,
         "groups": flights.groups,
         "edges": flights.edges,
-        "hysteresis": flights.hysteresis,
-        "next": flights.next,
+        "next": find_next_nodes(tour) if flights.edges else [],
         "poor": tour.poor,
         "walk": flights.walk,
         "unit": 1 / scene.frame.unit,
@@ -457,38 +420,26 @@ def _describe_scene(
 
 def _describe_plan(facts: TourFacts) -> dict[str, Any]:
     """The floor plan: its drawing, and where the panoramas are on it."""
-    svg, size, places = draw_page_plan(facts.plan)
-    rooms = [room.panoramas for room in facts.plan.rooms]
+    (svg, size, places), rooms = draw_page_plan(facts.plan), facts.plan.rooms
     return {
         "worlds": facts.tour.worlds,
-        "rooms": rooms,
+        "rooms": [room.panoramas for room in rooms],
+        "isSure": all(room.is_placed for room in rooms),
         "drawing": base64.b64encode(svg).decode(),
         "size": size,
         "places": places,
     }
 
 
-def _describe_links(
-    tour: TourGraph,
-    spots: Sequence[dict[str, Any]],
-    heights: Sequence[float],
-    outlooks: Sequence[Float[np.ndarray, "bin"]],
-) -> list[dict[str, Any]]:
-    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring.
-
-    Args:
-        tour: of the scene.
-        spots: the descriptions of the panoramas.
-        heights: of the cameras over the floor.
-        outlooks: of the panoramas (`measure_outlook`).
-    """
+def _describe_links(tour: TourGraph, spots: Sequence[dict[str, Any]], facts: TourFacts) -> list[dict[str, Any]]:
+    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring."""
     links = []
     for (start, end), link in tour.links.items():
         direction = tour.find_direction(start, end)
         assert direction is not None
-        yaw, pitch = find_angles(tour.level_axes.T @ direction)
+        yaw, pitch = find_angles(direction)
         found = {"from": start, "to": end, "text": link.text, "yaw": round(yaw, 5), "pitch": round(pitch, 5)}
-        ring = find_link_ring(tour, start, end, heights[start], outlooks[start])
+        ring = find_link_ring(tour, start, end, facts.usual_heights[start], facts.outlooks[start])
         if ring is not None and (tour.parts[start] != tour.parts[end] or end in spots[start]["hidden"]):
             found["mark"] = _round(np.array(spots[start]["position"]) + ring)
         links.append(found)
@@ -499,12 +450,8 @@ def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.n
     """Median distance of the Gaussians of each part from their cameras."""
     views = scene.gaussians.views.long()
     distances = (scene.gaussians.means.double() - scene.cam2world[views, :3, 3]).norm(dim=1).numpy()
-    reaches = np.full(parts.max() + 1, 1e-3)
-    for part in range(len(reaches)):
-        own = distances[parts[views] == part]
-        if len(own):
-            reaches[part] = max(float(np.median(own)), 1e-3)
-    return reaches
+    own = [distances[parts[views] == part] for part in range(parts.max() + 1)]
+    return np.array([max(float(np.median(each)) if len(each) else 0.0, 1e-3) for each in own])
 
 
 def _limit_parts(
@@ -512,9 +459,7 @@ def _limit_parts(
 ) -> list[float]:
     """How far the camera may move in each part from its edges; without edges, from the nearest panorama."""
     parts = list(flights.parts)
-    if not flights.edges:
-        if len(positions) == 1:
-            return [min(_SINGLE_REACH, 0.5 * float(reaches[0]))]
+    if not flights.edges and len(positions) > 1:
         distances = scipy.spatial.distance.cdist(positions, positions)
         longest_step = float(scipy.sparse.csgraph.minimum_spanning_tree(distances).toarray().max(initial=0.0))
         return [max(float(reaches[0]), 0.75 * longest_step)]

@@ -24,18 +24,18 @@ from pansplat.geometry.morton import morton_codes
 from pansplat.geometry.pose import AHEAD_EXPONENT
 from pansplat.system.files import SOFTWARE
 from pansplat.tours import route
-from pansplat.tours.graph import CLEARANCE, POOR_REACH
 from pansplat.tours.layout import REACH
+from pansplat.tours.limits import CLEARANCE, EDGE_HYSTERESIS, POOR_REACH
 from pansplat.tours.links import RING_DISTANCE, RING_RADIUS
 
-MAX_DEGREE = 3  # of the harmonics of a page
+MAX_DEGREE = 3  # highest degree of the harmonics of a page
 BATCH = 256  # quads that are drawn together
-_CONSTANT_BYTES = 23  # of a Gaussian, without harmonics of degree 1 and above
-_MORTON_BITS = 10  # of each coordinate
+_CONSTANT_BYTES = 23  # size of a Gaussian without harmonics of degree 1 and above
+_MORTON_BITS = 10  # bits of each coordinate in the order of a Z-curve
 _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
 
 
-Vector: TypeAlias = tuple[float, float, float]  # in the scene's world, relative to the page's origin
+Vector: TypeAlias = tuple[float, float, float]  # axes of the scene's world, relative to the page's origin
 
 
 class _Record(msgspec.Struct, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=True):
@@ -43,9 +43,8 @@ class _Record(msgspec.Struct, frozen=True, kw_only=True, rename="camel", forbid_
 
 
 class PageView(_Record):
-    """The Gaussians of a view: their camera, the first one, their number, and the files that hold them."""
+    """The Gaussians of a view: the first one, their number, and the files that hold them."""
 
-    position: Vector
     start: int
     count: int
     files: tuple[str, ...]
@@ -65,6 +64,7 @@ class PageSpot(_Record):
     Attributes:
         ahead: yaw and pitch of its start view, else of the widest one, radians.
         has_start: whether it has a start view.
+        turns: what a camera that arrives in each direction of the horizon turns by (`find_turns`), radians.
         hidden: panoramas whose marks surfaces hide.
         clearances: distances of the nearest surfaces around the camera (`measure_clearance`).
     """
@@ -75,6 +75,7 @@ class PageSpot(_Record):
     notes: tuple[PageNote, ...]
     ahead: tuple[float, float]
     has_start: bool
+    turns: tuple[float, ...]
     hidden: tuple[int, ...]
     clearances: tuple[tuple[float, ...], ...]
 
@@ -88,15 +89,6 @@ class PageLink(_Record):
     yaw: float
     pitch: float
     mark: Vector | msgspec.UnsetType = msgspec.UNSET
-
-
-class PageStart(_Record):
-    """The first camera; radians, and degrees of the vertical field of view."""
-
-    position: Vector
-    yaw: float
-    pitch: float
-    fov: float
 
 
 class PagePhotograph(_Record):
@@ -114,6 +106,7 @@ class PagePlan(_Record):
         worlds: of each panorama.
         rooms: the panoramas of each room.
         drawing: an SVG, base64.
+        is_sure: whether the places of all rooms are known; else some are dashed.
         size: its width and height, metres.
         places: of each panorama, to the right and down from the upper left corner, metres; and what yaws there are
             turned by, radians to the right, None if that is unknown.
@@ -122,6 +115,7 @@ class PagePlan(_Record):
     worlds: tuple[int, ...]
     rooms: tuple[tuple[int, ...], ...]
     drawing: str
+    is_sure: bool
     size: tuple[float, float]
     places: tuple[tuple[float, float, float | None], ...]
 
@@ -145,6 +139,7 @@ class PageConstants(_Record, kw_only=True):
     near: float = constants.NEAR
     filter_variance: float = constants.FILTER_VARIANCE
     tallest: float = 1.5  # height of a portrait image relative to a landscape one
+    start_fov: float = 75.0  # vertical field of view of a landscape image at the start, degrees
     min_fov: float = constants.MIN_FOV_DEGREES
     max_fov: float = constants.MAX_FOV_DEGREES
     max_pitch: float = math.radians(constants.MAX_PITCH_DEGREES)
@@ -152,6 +147,7 @@ class PageConstants(_Record, kw_only=True):
     fast: float = constants.FAST
     clearance: float = CLEARANCE
     poor_reach: float = POOR_REACH
+    hysteresis: float = EDGE_HYSTERESIS
     reach: float = REACH
     ring_radius: float = RING_RADIUS
     ring_distance: float = RING_DISTANCE
@@ -179,8 +175,8 @@ class PageHeader(PageConstants, kw_only=True):
         count, degree, color_range, harmonics_scale: of the Gaussians (`PackedGaussians`).
         loading: views in the order of their data.
         level: axes of a level camera (columns right, down, forward).
-        parts, groups, edges, hysteresis, next, poor: the graph of the tour (graph.js).
-        walk: the panoramas in the order of a visit of all.
+        parts, groups, edges, next, poor: the graph of the tour (graph.js).
+        walk: the panoramas in the order of a visit of all; the page starts at the first one.
         unit: of a metre in the page.
         limits: how far the camera may go in each part; 0 where it stands at photographs, and there are no Gaussians.
         folder: address of the folder with the files; None of a page in one file.
@@ -195,11 +191,9 @@ class PageHeader(PageConstants, kw_only=True):
     spots: tuple[PageSpot, ...]
     links: tuple[PageLink, ...]
     level: tuple[Vector, Vector, Vector]
-    start: PageStart
     parts: tuple[int, ...]
     groups: tuple[tuple[int, ...], ...]
     edges: tuple[tuple[int, int, int], ...]
-    hysteresis: float
     next: tuple[tuple[int, ...], ...]
     poor: tuple[tuple[int, int], ...]
     walk: tuple[int, ...]

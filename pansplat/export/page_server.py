@@ -21,7 +21,7 @@ from pansplat.export.page import PageFiles
 from pansplat.system.console import can_print
 
 PORT = 8443  # or any free one
-_DAYS = 30  # of a certificate
+_DAYS = 30  # for which a certificate is valid
 _TIMEOUT = 60.0  # seconds without a byte after which a connection is closed
 _TYPES = {".html": "text/html; charset=utf-8", ".bin": "application/octet-stream", ".jpg": "image/jpeg"}
 _ELSEWHERE = ("192.0.2.1", 9)  # an address of documentation (RFC 5737), to which nothing is sent

@@ -10,7 +10,7 @@ import numpy as np
 
 from pansplat.images.blur_masks import fill_hidden
 from pansplat.images.image_files import read_height, read_mask, read_panorama, write_image
-from pansplat.inputs.pairs import Panorama, is_panorama_name
+from pansplat.inputs.panorama_sets import Panorama, is_panorama_name
 from pansplat.inputs.photographs import LINKS, describe_notes
 from pansplat.system.files import make_unique_name
 from pansplat.system.progress import report_progress, stage

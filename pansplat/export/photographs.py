@@ -31,13 +31,15 @@ from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import read_face_size
 from pansplat.images.masks import mask_holes
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, make_unique_name
 from pansplat.system.progress import report_progress
-from pansplat.tours.graph import TourGraph, make_graph, select_views
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.scene_views import choose_scene_views
 
-MIN_HEIGHT = 1024  # of a photograph in a page, pixels, unless it is smaller
-MAX_HEIGHT = 4096  # of a photograph in a folder
+MIN_HEIGHT = 1024  # least height of a photograph in a page, pixels, unless its file is smaller
+MAX_HEIGHT = 4096  # largest height of a photograph in a folder, pixels
 _FACE = 2 / math.pi  # largest size of a face, of the photograph's height: its centre is as dense
 _STEP = 16  # divides the size of a face, pixels
 _LABEL = 40  # letters of the name of a panorama in names of files
@@ -45,9 +47,9 @@ _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels
 _TILE = 1344  # largest size of a tile; a photograph of 4,096 rows has 36
 # Of JPEG, which keeps the grain of walls; WebP of the same size has 1 dB more and loses up to a fifth of the gradient.
 _QUALITY, _FOLDER_QUALITY, _PREVIEW_QUALITY, _LOWER_QUALITIES = 82, 90, 75, (75, 65)
-_SHRINK = 0.95  # of a height that is too large for the page, at most
-_HIDDEN_ROWS = 512  # of the image of the Gaussians in what masks hide
-_GUARD, _FEATHER = 3, 1 / 128  # around it: pixels of which nothing is shown, and of the height, which fade
+_SHRINK = 0.95  # largest factor of the next height, where one is too large for the page
+_HIDDEN_ROWS = 512  # rows of the image of the Gaussians that replaces what masks hide
+_GUARD, _FEATHER = 3, 1 / 128  # borders of what masks hide: hidden pixels, and a share of the height that fades
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +110,15 @@ def label_files(names: Sequence[str]) -> list[str]:
     return labels
 
 
-def list_photographs(source: Pair | TourGraph, views: Sequence[int]) -> list[Pair]:
+def list_photographs(source: PanoramaSet | TourGraph, views: Sequence[int]) -> list[PanoramaSet]:
     """A pair of one panorama for each of some views of a scene that was predicted from a pair or tour."""
     if isinstance(source, TourGraph):
-        return [source.make_pair([view]) for view in views]
+        return [source.make_set([view]) for view in views]
     return [dataclasses.replace(source, context=(source.context[view],)) for view in views]
 
 
 def pack_photographs(
-    scene: Scene, photographs: Sequence[Pair], num_bytes: float, height: int | None
+    scene: Scene, photographs: Sequence[PanoramaSet], num_bytes: float, height: int | None
 ) -> list[PackedPhotograph]:
     """The photographs of a scene's views, within a number of bytes if that is possible.
 
@@ -153,7 +155,7 @@ def pack_photographs(
 
 
 @torch.no_grad()
-def read_photograph(scene: Scene, view: int, photograph: Pair, height: int) -> Float[Tensor, "3 height width"]:
+def read_photograph(scene: Scene, view: int, photograph: PanoramaSet, height: int) -> Float[Tensor, "3 height width"]:
     """A photograph of at most a height, with the exposure of the Gaussians, and without what its masks hide."""
     image, shown = load_photograph(photograph, height)
     if scene.joint and scene.gains:  # the Gaussians of single views have the exposure of their photographs
@@ -167,7 +169,7 @@ def read_photograph(scene: Scene, view: int, photograph: Pair, height: int) -> F
 
 
 def load_photograph(
-    photograph: Pair, height: int
+    photograph: PanoramaSet, height: int
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
     """The picture of a pair of one panorama, of at most a height, and where it may be shown: 0 in what masks hide."""
     views = photograph.load_context(max(min(height, photograph.image_height), 2))  # faces need two rows
@@ -179,11 +181,11 @@ def load_photograph(
 def _select_shown(scene: Scene, view: int) -> tuple[Scene, Float[Tensor, "4 4"]]:
     """What a page draws at a panorama, and its pose (4, 4)."""
     pose = scene.cam2world[view]
-    if not scene.overlaps:
+    if scene.tour is None:
         return scene, pose
     tour = make_graph(scene)
     edge, _ = tour.find_nearest_edge(pose[:3, 3].numpy())
-    return select_views(scene, tour.choose_scene_views()[edge]), pose
+    return select_views(scene, choose_scene_views(tour)[edge]), pose
 
 
 def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

@@ -35,10 +35,7 @@ _INCH = 0.0254  # metres
 _DOTS_PER_INCH = 150
 _MARGIN, _LINE = 0.8, 0.35  # around a storey, and between lines of notes, metres
 _TEXT, _SMALL_TEXT, _LEAST_TEXT = 0.22, 0.13, 0.08  # heights, metres
-_SMALL_SHEET, _SMALL_SHEET_TEXT = (
-    5.5,
-    0.17,
-)  # metres: width whose texts are legible in a quarter of a window; the largest
+_SMALL_SHEET, _SMALL_SHEET_TEXT = 5.5, 0.17  # metres: width and largest text that a quarter of a window shows legibly
 _LETTER = 0.72  # width of a letter, of its height
 _MEASURED = 0.6  # metres, the shortest wall whose length is written
 _UPWARDS = math.radians(1)  # texts from -89 to 91 degrees are read from the left or from below
@@ -107,7 +104,7 @@ def draw_page_plan(plan: Plan) -> tuple[bytes, tuple[float, float], list[tuple[f
 def describe_plan(plan: Plan) -> list[str]:
     """Lines on the size of a plan and its uncertainty."""
     closed = [room for room in plan.rooms if room.is_closed]
-    area = sum(room.area for room in closed)
+    area = sum(room.shape.area for room in closed)
     spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
     count = describe_count(plan.num_heights, "panorama")
     lines = [
@@ -135,7 +132,7 @@ def _format_number(plan: Plan, value: float, decimals: int, power: int = 1) -> s
         value: in metres of the plan.
         decimals: of metres; in other units as many digits are written.
     """
-    factor = plan.frame.unit**power
+    factor = plan.tour.panoramas[0].frame.unit ** power
     return f"{factor * value:.{max(decimals - round(math.log10(factor)), 0)}f}"
 
 
@@ -237,7 +234,8 @@ class _Drawing:
     @cached_property
     def notes(self) -> list[str]:
         """Lines below the plan."""
-        scale = f"1:{self.plan.frame.unit / _PAPER:g} on paper; the bar is {self.plan.frame.unit:g} m"
+        unit = self.plan.tour.panoramas[0].frame.unit
+        scale = f"1:{unit / _PAPER:g} on paper; the bar is {unit:g} m"
         return [] if self.is_small else [*describe_plan(self.plan), scale]
 
     def list_texts(self) -> list[_Text]:
@@ -248,7 +246,9 @@ class _Drawing:
             (_SMALL_SHEET_TEXT, _SMALL_TEXT, 0.75 * _SMALL_TEXT) if self.is_small else (_TEXT, _SMALL_TEXT, _LEAST_TEXT)
         )
         large, small, least = (self.enlarged * size for size in sizes)
-        taken = shapely.MultiPoint(self.panoramas).buffer(small) | shapely.box(0, 0, *self.size).exterior.buffer(0.01)
+        taken = shapely.MultiPoint(self.panoramas).buffer(0.7 * small) | shapely.box(0, 0, *self.size).exterior.buffer(
+            0.01
+        )
         texts: list[_Text] = []
 
         def add(*options: _Text) -> None:
@@ -263,7 +263,8 @@ class _Drawing:
             free -= shapely.MultiPoint(others).buffer(6 * small)
             circle = shapely.maximum_inscribed_circle(shape if free.is_empty else free)
             (x, y), radius = circle.coords[0], circle.length
-            area, error = (_format_number(self.plan, v, 1, power=2) for v in (room.area, self.plan.area_error(room)))
+            values = room.shape.area, self.plan.area_error(room)
+            area, error = (_format_number(self.plan, value, 1, power=2) for value in values)
             lines = [f"{area} m² ± {error}"] * room.is_closed + ["about here"] * (room.panoramas[0] in self.plan.drawn)
             for row, text in zip((0.7, -0.7, -2.1), [room.name, *lines[: 0 if self.is_small else None]], strict=False):
                 size = min(large, 0.9 * radius / math.hypot(_LETTER * len(text) / 2, abs(row) + 0.5))
@@ -273,8 +274,8 @@ class _Drawing:
         for node, (x, y) in enumerate(self.panoramas.tolist()):
             if node not in inside:
                 name = self.plan.tour.panoramas[node].label
-                away = 1.5 * small + _LETTER * small * len(name) / 2
-                places = (x + away, y), (x - away, y), (x, y + 2 * small), (x, y - 2 * small)
+                away, beyond = 1.1 * small + _LETTER * small * len(name) / 2, 1.3 * small
+                places = (x + away, y), (x - away, y), (x, y + beyond), (x, y - beyond)
                 options = [_Text("PANORAMAS", place, name, small) for place in places]
                 add(*sorted(options, key=lambda text: LineString(((x, y), text.place)).intersects(walls)))
         for room, corners in [each for each in outlines.items() if each[0].is_closed and not self.is_small]:

@@ -19,7 +19,7 @@ from pansplat.geometry.equirect import pad_equirect, uv_from_directions
 from pansplat.images.blur_masks import fill_hidden
 from pansplat.images.image_files import read_height, read_panorama, write_image
 from pansplat.images.rig_images import Lens
-from pansplat.inputs.pairs import Panorama, read_scene_mask
+from pansplat.inputs.panorama_sets import Panorama, read_scene_mask
 from pansplat.inputs.reconstructions.colmap import write_colmap
 from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
 from pansplat.system.progress import report_progress, stage
@@ -49,7 +49,7 @@ def write_dataset(
     Args:
         folder: an empty one.
         views: the panoramas, in a world of metres with y down.
-        siblings: panoramas in which static content is detected, see `pansplat.inputs.pairs.Pair`.
+        siblings: panoramas in which static content is detected, see `pansplat.inputs.panorama_sets.PanoramaSet`.
         points, colors: positions, metres, and 8-bit sRGB.
 
     Returns:

@@ -21,9 +21,9 @@ def keep_gaussians(scene: Scene, kept: Bool[Tensor, "n"], views: Sequence[int] |
 
     Args:
         scene: a scene.
-        kept: of its Gaussians.
-        views: in ascending order; by default those that have Gaussians. For deferred blending, Gaussians of other views
-            are left out. For joint drawing, they belong to the nearest one of these.
+        kept: True for the Gaussians that stay.
+        views: in the order of their new numbers; by default those that have Gaussians. For deferred blending,
+            Gaussians of other views are left out. For joint drawing, they belong to the nearest one of these.
     """
     gaussians, count = scene.gaussians, len(scene.cam2world)
     if not count:
@@ -41,21 +41,14 @@ def keep_gaussians(scene: Scene, kept: Bool[Tensor, "n"], views: Sequence[int] |
         own[lost] = torch.tensor(chosen, device=own.device)[nearest]
     kept = kept & (number[own] >= 0)
     part = gaussians.select(kept)
-    new = {old: index for index, old in enumerate(chosen)}
-    edges = {(new[a], new[b]): overlap for a, b, overlap in scene.overlaps if a in new and b in new}
-    if scene.overlaps:
-        joined = {view for edge in edges for view in edge}
-        edges |= {(view, view): 1.0 for view in range(len(chosen)) if view not in joined}
     return dataclasses.replace(
         scene,
         gaussians=dataclasses.replace(part, views=number[own[kept]].to(gaussians.views)),
         cam2world=scene.cam2world[chosen],
         names=tuple(scene.names[view] for view in chosen if view < len(scene.names)),
         gains=tuple(scene.gains[view] for view in chosen) if scene.gains else (),
-        overlaps=tuple((a, b, overlap) for (a, b), overlap in edges.items()),
-        links=tuple((new[a], new[b], *rest) for a, b, *rest in scene.links if a in new and b in new),
         starts=tuple(scene.starts[view] for view in chosen) if scene.starts else (),
-        approximate=tuple((new[a], new[b], *rest) for a, b, *rest in scene.approximate if a in new and b in new),
+        tour=scene.tour.select(chosen) if scene.tour and chosen else None,
     )
 
 

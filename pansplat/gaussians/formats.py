@@ -42,7 +42,7 @@ from pansplat.geometry.morton import morton_codes
 from pansplat.system.atomic import replacing
 from pansplat.system.files import find_scene_suffix, read_file, require_file
 
-_MAX_FILE = 1 << 32  # bytes
+_MAX_FILE = 1 << 32  # bytes of the largest file that is read or written
 _MAX_ENTRY_BYTES = 1 << 26  # bytes of the largest pansplat entry
 _EXPANSION, _FREE_BYTES = 256, 1 << 26  # limit of the decoded bytes: for each byte of the file, and in addition
 _DECODED_BYTES = 236  # bytes of a decoded Gaussian with harmonics of degree 3

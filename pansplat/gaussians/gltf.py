@@ -48,7 +48,7 @@ _MAX_DEGREE = 3  # highest degree of the harmonics in KHR_gaussian_splatting
 _MAX_JSON = 1 << 26  # bytes of the largest JSON part
 _MAX_NODES = 1 << 14  # nodes of a scene, at most, so that a cycle of nodes ends
 _MAGIC, _VERSION, _JSON, _BINARY = b"glTF", 2, 0x4E4F534A, 0x004E4942
-_POINTS, _ARRAY_BUFFER = 0, 34962
+_POINTS, _ARRAY_BUFFER = 0, 34962  # glTF's numbers of a primitive of points, and of a view of vertices
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 

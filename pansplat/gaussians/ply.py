@@ -39,7 +39,7 @@ from pansplat.gaussians.scene_files import (
     sort_by_label,
 )
 from pansplat.system.atomic import replacing
-from pansplat.system.files import SOFTWARE, require_file
+from pansplat.system.files import PLY_TYPES, SOFTWARE, require_file
 
 OPACITY_EPSILON = 1e-6  # opacities are clamped to this distance from 0 and 1, where the logit is infinite
 SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarithm is finite
@@ -50,11 +50,6 @@ _RUNS_SPACE = 4096  # bytes of a header for about 300 runs; some browser viewers
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
 _MAX_PROPERTIES = 1 << 10  # properties that an element may have
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
-    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
 
 
 def save_ply(scene: Scene, path: str | Path) -> None:
@@ -283,7 +278,7 @@ def _read_header(file: BufferedIOBase, path: Path) -> _Header:
             elif words[:1] == ["element"]:
                 elements.append((words[1], int(words[2]), []))
             elif words[:1] == ["property"]:
-                kind = None if words[1] == "list" else _TYPES[words[1]]
+                kind = None if words[1] == "list" else PLY_TYPES[words[1]]
                 elements[-1][2].append((words[-1], kind))
                 if len(elements[-1][2]) > _MAX_PROPERTIES:
                     raise ValueError("too many properties")

@@ -19,19 +19,37 @@ from pansplat.system.descriptions import describe_count, describe_range, list_fi
 Gains = tuple[tuple[float, ...], ...]
 """Factors of R, G and B for each view's photograph."""
 
-Overlaps = tuple[tuple[int, int, float], ...]
-"""Edges of a tour graph: two views, the smaller one first, and their overlap; a view twice if it has no other edge."""
-
-Links = tuple[tuple[int, int, float, float, str], ...]
-"""Links between panoramas: from view to view, yaw (to the right) and pitch (below the horizon) in radians, and text."""
-
 Starts = tuple[tuple[float, float] | None, ...]
-"""Yaw and pitch, as of a link, of the view of each panorama that a visitor sees first; None if there is none."""
+"""For each panorama the view that a visitor sees first: its yaw (to the right) and pitch (below the horizon), radians;
+None if there is none."""
 
 
-ApproximatePlaces = tuple[tuple[int, int, float, float, float], ...]
-"""About where panoramas are drawn on a plan: view, the view that it is beside, to the right and forward of that camera
-in the user's unit, and yaw relative to it (to the right, radians)."""
+@dataclass(frozen=True)
+class SceneTour:
+    """How the views of a scene of a whole tour are connected.
+
+    Attributes:
+        overlaps: edges of the tour's graph: two views, the smaller one first, and their overlap, 0 through a wall. A
+            view without another edge has one to itself, with 1.
+        links: ways from one view towards another: both views, yaw and pitch in radians (as of `Starts`), and text.
+        approximate: about where views are that are not placed: view, the view that it is beside, to the right and
+            forward of that camera in the user's unit, and yaw relative to it (to the right, radians).
+    """
+
+    overlaps: tuple[tuple[int, int, float], ...]
+    links: tuple[tuple[int, int, float, float, str], ...] = ()
+    approximate: tuple[tuple[int, int, float, float, float], ...] = ()
+
+    def select(self, views: Sequence[int]) -> SceneTour:
+        """The tour of some views, which are numbered anew."""
+        new = {old: number for number, old in enumerate(views)}
+        overlaps, links, approximate = (
+            tuple((new[a], new[b], *rest) for a, b, *rest in rows if a in new and b in new)
+            for rows in (self.overlaps, self.links, self.approximate)
+        )
+        joined = {view for a, b, _ in overlaps for view in (a, b)}
+        alone = ((view, view, 1.0) for view in range(len(new)) if view not in joined)
+        return SceneTour((*overlaps, *alone), links, approximate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +180,8 @@ class Scene:
         gains: mean exposure and white balance of each view's photograph, as factors of R, G and B relative to the
             geometric mean of all. The colours of a view's Gaussians are those of its photograph, in joint drawing
             between those of all (`pansplat.rendering.gains`).
-        overlaps: of a scene of a whole tour: the edges of its graph, see `pansplat.tours.graph.TourGraph`.
-        links: of a scene of a whole tour: the known directions from one panorama towards another one.
-        starts: of a scene of a whole tour: one for each view, or none.
-        approximate: of a scene of a whole tour: of views whose place relative to others is not known.
+        starts: one for each view, or none.
+        tour: how the views are connected; None if the scene is not that of a whole tour.
         joint: whether the Gaussians of all views belong in one image, as other programs draw them. Else those of a view
             show its whole surroundings, and images of single views are blended ("deferred").
         frame: where the world of the Gaussians and cameras is in the user's world, that of files.
@@ -179,10 +195,8 @@ class Scene:
     model: str = ""
     height: int = 512
     gains: Gains = ()
-    overlaps: Overlaps = ()
-    links: Links = ()
     starts: Starts = ()
-    approximate: ApproximatePlaces = ()
+    tour: SceneTour | None = None
     joint: bool = False
     frame: WorldFrame = USER_FRAME
 

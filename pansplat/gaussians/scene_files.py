@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.gaussians.scene import Gaussians, Scene, prune
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour, prune
 from pansplat.geometry.world import MAX_POSITION, WorldFrame, choose_unit, require_depth_range
 from pansplat.system.strict_json import convert, parse_json
 
@@ -43,6 +43,7 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
     Args:
         runs: see `find_label_runs`.
     """
+    tour = scene.tour or SceneTour(())
     content = {
         "version": 1,
         "model": scene.model,
@@ -53,10 +54,10 @@ def format_entry(scene: Scene, runs: list[list[int]]) -> str:
         "cam2world": scene.cam2world.double().cpu().tolist(),
         **({"origin": scene.frame.origin} if any(scene.frame.origin) else {}),
         **({"gains": scene.gains} if scene.gains else {}),
-        **({"overlaps": scene.overlaps} if scene.overlaps else {}),
-        **({"links": [[*link[:4], _escape(link[4])] for link in scene.links]} if scene.links else {}),
+        **({"overlaps": tour.overlaps} if tour.overlaps else {}),
+        **({"links": [[*link[:4], _escape(link[4])] for link in tour.links]} if tour.links else {}),
         **({"starts": scene.starts} if any(scene.starts) else {}),
-        **({"approximate": scene.approximate} if scene.approximate else {}),
+        **({"approximate": tour.approximate} if tour.approximate else {}),
         **({"joint": True} if scene.joint else {}),
         "runs": runs,
     }
@@ -84,6 +85,7 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
     kept = select_finite(replace(gaussians, levels=levels, views=views), path)
     if len(gaussians) and not len(kept):
         raise InputError(f"{path}: none of its {len(gaussians)} Gaussians is finite; write the file again")
+    overlaps = tuple({pair[:2]: pair for pair in stated.overlaps}.values())
     scene = Scene(
         kept,
         torch.tensor(stated.cam2world, dtype=torch.float64).reshape(-1, 4, 4),
@@ -93,10 +95,8 @@ def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
         stated.model,
         stated.height,
         tuple(stated.gains),
-        tuple({pair[:2]: pair for pair in stated.overlaps}.values()),
-        tuple(stated.links),
         tuple(stated.starts),
-        tuple(stated.approximate),
+        SceneTour(overlaps, tuple(stated.links), tuple(stated.approximate)) if overlaps else None,
         joint=stated.joint is True,
         frame=WorldFrame(origin=stated.origin),
     )

@@ -15,6 +15,7 @@ from pansplat.geometry.pose import interpolate_poses
 
 _MIN_STEP = 1e-6  # metres; a shorter step has no direction
 _EXCURSION_DIAMETER = 0.4  # metres; a single camera flies on a circle of this diameter
+_TURN = math.radians(40)  # largest turn of a flight to each side
 
 
 def ease_in_out(fraction: float) -> float:
@@ -124,9 +125,7 @@ def level_axes(cam2world: Float[Tensor, "view 4 4"]) -> Float[np.ndarray, "3 3"]
     return look_pose(torch.zeros(3), forward, up_direction(cam2world))[:3, :3].numpy()
 
 
-def fly_pose(
-    cam2world: Float[Tensor, "view 4 4"], fraction: float, *, turn_degrees: float = 40.0
-) -> Float[Tensor, "4 4"]:
+def fly_pose(cam2world: Float[Tensor, "view 4 4"], fraction: float) -> Float[Tensor, "4 4"]:
     """Pose at a fraction of a flight through all cameras.
 
     The camera starts and stops smoothly. It looks along the path and turns slowly to the left and then to the right, so
@@ -136,7 +135,6 @@ def fly_pose(
     Args:
         cam2world: the cameras in the order of the flight; at least one.
         fraction: time from 0 (first camera) to 1 (last camera); clamped.
-        turn_degrees: largest turn to each side.
 
     Raises:
         ValueError: without any camera.
@@ -151,7 +149,7 @@ def fly_pose(
         pose = pose.clone()
         pose[:3, 3] += 0.5 * _EXCURSION_DIAMETER * ((1 - math.cos(angle)) * pose[:3, 2] - math.sin(angle) * pose[:3, 0])
     # The turn depends on the eased fraction, so that it also starts and stops smoothly.
-    return turn_pose(pose, -math.radians(turn_degrees) * math.sin(2 * math.pi * eased), up)
+    return turn_pose(pose, -_TURN * math.sin(2 * math.pi * eased), up)
 
 
 def _interpolate_path(poses: Float[Tensor, "stop 4 4"], fraction: float) -> Float[Tensor, "4 4"]:

@@ -120,8 +120,8 @@ def blend_weights(
     Source: PanSplat, section 3.4 (deferred blending), for any number of views; docs/rendering.md, section 7.
 
     Args:
-        position: of the camera.
-        positions: of the input views.
+        position: the camera's.
+        positions: those of the input views.
         forward: unit direction of a perspective picture. An input view ahead weighs more, one behind less: it has seen
             from nearer what is ahead.
     """

@@ -104,7 +104,7 @@ def warp_panorama(
 
     Args:
         maps: the other panorama.
-        inverse_depth: of the reference pixels, 1 / metres.
+        inverse_depth: candidates of the reference pixels, 1 / metres.
         pose: from the reference camera's axes to the other's.
     """
     with torch.no_grad():

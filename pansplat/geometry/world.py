@@ -31,8 +31,8 @@ class WorldFrame:
     """Where the working world is in the user's world: a place p of the first is at `unit` p + `origin` of the second.
 
     Attributes:
-        unit: of the working world, about a metre, in the user's unit: 1, or a power of 1000.
-        origin: of the working world, in the user's unit.
+        unit: what the working world counts in, about a metre, in the user's unit: 1, or a power of 1000.
+        origin: where the working world begins, in the user's unit.
     """
 
     unit: float = 1.0

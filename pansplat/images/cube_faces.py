@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from pansplat.errors import InputError, InputWarning
@@ -111,3 +111,10 @@ def find_gap(level: CubeLevel, folder: Path) -> str | None:
         except InputError:
             return f"{file} is damaged"
     return None
+
+
+def keep_complete(levels: Iterable[CubeLevel], folder: Path) -> tuple[list[CubeLevel], str | None]:
+    """The complete levels of a size that can be read, the smallest first, and a gap of the others (`find_gap`)."""
+    gaps = {level: find_gap(level, folder) for level in levels if 0 < level.size <= MAX_SIZE}
+    complete = [level for level, gap in gaps.items() if gap is None]
+    return sorted(complete, key=lambda level: level.size), next((gap for gap in [*gaps.values()][::-1] if gap), None)

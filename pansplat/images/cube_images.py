@@ -14,22 +14,22 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Protocol
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from msgspec import Meta
 from numpy import ndarray as Array
 
 from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_of, face_rotations
 from pansplat.system.files import read_file
 from pansplat.system.store import cache_folders, hash_parts, write_cache_file
-from pansplat.system.strict_json import read_json
 
 CUBE_SUFFIX = ".cube.json"
 BESIDE = "beside"  # key of a file that stands for a panorama: the folder of what belongs to it, such as masks
@@ -56,9 +56,9 @@ class CubeLevel:
         faces: paths relative to the cube's folder, with `ROW` and `COLUMN` for tiles.
     """
 
-    size: int
-    tile: int
-    faces: tuple[str, ...]
+    size: Annotated[int, Meta(ge=1, le=MAX_SIZE)]
+    tile: Annotated[int, Meta(ge=1)]
+    faces: Annotated[tuple[str, ...], Meta(min_length=6, max_length=6)]
 
     def list_files(self) -> Iterator[str]:
         """Relative paths of all pictures."""
@@ -95,12 +95,12 @@ class CubeImage:
     """A panorama of cube faces.
 
     Attributes:
-        folder: of the pictures.
+        folder: the folder that holds the pictures.
         levels: complete ones, the smallest first.
     """
 
     folder: Path
-    levels: tuple[CubeLevel, ...]
+    levels: Annotated[tuple[CubeLevel, ...], Meta(min_length=1)]
 
     @property
     def height(self) -> int:
@@ -119,26 +119,32 @@ class CubeImage:
 
 def write_cube(cube: CubeImage, folder: Path, name: str) -> Path:
     """Write the file that stands for a cube; see `write_description`."""
-    content = {"folder": str(cube.folder.resolve()), "levels": [dataclasses.asdict(level) for level in cube.levels]}
-    return write_description(content, cube.list_files(), folder, name + CUBE_SUFFIX)
+    return write_description(dataclasses.replace(cube, folder=cube.folder.resolve()), folder, name + CUBE_SUFFIX)
 
 
-def write_description(content: dict[str, Any], pictures: Iterable[Path], folder: Path, name: str) -> Path:
+class Assembled(Protocol):
+    """A panorama that is made from pictures: a dataclass, whose fields are the content of the file for it."""
+
+    def list_files(self) -> Iterator[Path]:
+        """The files of all pictures."""
+        ...
+
+
+def write_description(panorama: Assembled, folder: Path, name: str) -> Path:
     """Write a file that stands for a panorama, if it has changed; it changes with every picture's time or size.
 
     Args:
-        content: of the file.
-        pictures: that the panorama is made from.
-        folder: of the tour, in whose cache folder the file is written.
+        panorama: all of its paths are whole.
+        folder: the tour's; the file is written in its cache folder.
         name: valid as a file name. The file is in a folder of its content: tours of one folder may have equal names.
     """
-    content |= {BESIDE: str(folder.resolve())}
-    name = f"{hash_parts(json.dumps(content))}/{name}"
+    content = dataclasses.asdict(panorama) | {BESIDE: folder.resolve()}
+    name = f"{hash_parts(json.dumps(content, default=str))}/{name}"
     digest = hashlib.blake2b(digest_size=12)
-    for picture in pictures:
+    for picture in panorama.list_files():
         status = os.stat(picture)
         digest.update(b"%d %d;" % (status.st_size, status.st_mtime_ns))
-    text = json.dumps(content | {"pictures": digest.hexdigest()}).encode()
+    text = json.dumps(content | {"pictures": digest.hexdigest()}, default=str).encode()
     folders = cache_folders(folder)
     for path in (cache / name for cache in folders):
         if path.is_file() and read_file(path) == text:
@@ -149,25 +155,6 @@ def write_description(content: dict[str, Any], pictures: Iterable[Path], folder:
             f"{folder}: needed a writable cache folder for the cube faces, got none of {folders}; make one."
         )
     return written
-
-
-def read_cube(path: Path) -> CubeImage:
-    """The cube that a file of `write_cube` stands for."""
-    content = read_json(path, dict[str, Any])
-    try:
-        first, *larger = (_read_level(level) for level in content["levels"])
-        return CubeImage(Path(content["folder"]), (first, *larger))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: needed a description of cube faces, got another content; delete the file."
-        ) from error
-
-
-def _read_level(content: dict[str, Any]) -> CubeLevel:
-    level = CubeLevel(int(content["size"]), int(content["tile"]), tuple(map(str, content["faces"])))
-    if not (0 < level.size <= MAX_SIZE and level.tile > 0 and len(level.faces) == 6):
-        raise ValueError
-    return level
 
 
 def equirect_from_faces(faces: list[UInt8[Array, "size size 3"]], height: int) -> UInt8[Array, "height width 3"]:

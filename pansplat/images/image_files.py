@@ -36,11 +36,12 @@ from pansplat.images.blur_masks import (
     resize_hidden,
     widen_hidden,
 )
-from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage, read_cube
+from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
 from pansplat.images.panorama_metadata import SOFTWARE_XMP, find_stated_problem, find_xmp, make_gpano_xmp
-from pansplat.images.rig_images import RIG_SUFFIX, RigImage, read_rig
+from pansplat.images.rig_images import RIG_SUFFIX, RigImage
 from pansplat.system.atomic import replacing
 from pansplat.system.files import SOFTWARE, read_file, require_file
+from pansplat.system.strict_json import read_json
 
 WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".exr")
 READABLE_SUFFIXES = (*WRITABLE_SUFFIXES, ".tif", ".tiff")
@@ -128,7 +129,8 @@ def read_face_size(path: Path | str) -> int:
     """Size of a cube face that has the detail of an image file, pixels: that of the file's faces, else with as many
     pixels for an angle in its middle as the panorama, width / pi. No pixels are decoded."""
     path = Path(path)
-    return read_cube(path).levels[-1].size if path.name.endswith(CUBE_SUFFIX) else int(2 * read_height(path) / math.pi)
+    cube = _read_assembled(path) if is_assembled(path) else None
+    return cube.levels[-1].size if isinstance(cube, CubeImage) else int(2 * read_height(path) / math.pi)
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
@@ -156,7 +158,8 @@ def _read_shape(path: Path) -> tuple[int, int, str | None]:
         with open(path, "rb") as file:
             head = file.read(len(_EXR_MAGIC))
         if head.startswith(_EXR_MAGIC):
-            return (*_exr_size(path), None)
+            (left, top), (right, bottom) = np.array(_read_exr(path, header_only=True)).tolist()
+            return right - left + 1, bottom - top + 1, None
         with Image.open(path, formats=_PILLOW_FORMATS) as image:
             size = image.size
             # Pillow would decode the pixels of a PNG to look for EXIF behind them, and turns the size of a TIFF itself.
@@ -183,7 +186,7 @@ def is_assembled(path: Path) -> bool:
 
 
 def _read_assembled(path: Path) -> CubeImage | RigImage:
-    return read_rig(path) if path.name.endswith(RIG_SUFFIX) else read_cube(path)
+    return read_json(path, RigImage if path.name.endswith(RIG_SUFFIX) else CubeImage)
 
 
 def list_pictures(path: Path) -> list[Path]:
@@ -299,7 +302,7 @@ def read_depth(path: Path | str, height: int) -> Float[Tensor, "height width"]:
     _check_height(height)
     data = _read_bytes(path)
     if data.startswith(_EXR_MAGIC):
-        channels = _exr_channels(path)
+        channels = _read_exr(path)
         name = next((n for n in ("Z", "Y") if n in channels), None)
         if name is None:
             raise InputError(f"{path}: needed depth in channel Z or Y, got channels {sorted(channels)}; rename it.")
@@ -609,24 +612,14 @@ def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
     return _DecodedImage(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
 
 
-def _exr_size(path: Path) -> tuple[int, int]:
+def _read_exr(path: Path, *, header_only: bool = False) -> Any:
+    """The channels of an EXR by name, or the corners of its data window."""
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            corners = np.array(file.header()["dataWindow"])
-    except Exception as error:  # OpenEXR has no base class of its errors
-        raise InputError(
-            f"{path}: needed a complete EXR image, got a damaged header ({error}); export it again."
-        ) from error
-    return int(corners[1, 0] - corners[0, 0] + 1), int(corners[1, 1] - corners[0, 1] + 1)
-
-
-def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path)) as file:
+        with OpenEXR.File(str(path), header_only=header_only) as file:
+            if header_only:
+                return file.header()["dataWindow"]
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR has no base class of its errors
         raise InputError(
@@ -635,7 +628,7 @@ def _exr_channels(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _decode_exr(path: Path) -> _DecodedImage:
-    channels = _exr_channels(path)
+    channels = _read_exr(path)
     alpha = channels.get("A")
     if "RGBA" in channels:
         linear, alpha = channels["RGBA"][..., :3], channels["RGBA"][..., 3]

@@ -26,7 +26,7 @@ from pansplat.images.image_files import list_masks, read_thumbnail
 
 Array = NDArray[Any]
 
-_HEIGHT = 256  # pixels; height of the panoramas for detection
+_HEIGHT = 256  # rows of the panoramas for detection
 _MAX_IMAGES = 16  # evenly spaced panoramas of a long sequence that are compared
 _MIN_DIFFERENCE = 0.02  # mean grey difference; two panoramas with less count as taken at one place
 
@@ -37,7 +37,7 @@ _MIN_RADIUS, _MAX_RADIUS = 4.0, 45.0  # degrees from the pole to the outline
 _MAX_BEND = 2  # largest change of the outline's ring between neighbouring sectors
 _EDGE_QUANTILE = 0.2  # quantile over the panoramas: four of five must have an edge
 _MIN_EDGE = 0.02  # grey contrast over a degree
-_MIN_COVERAGE = 0.85  # least fraction of the outline with that contrast
+_MIN_COVERAGE = 0.85  # least fraction of the outline with the contrast _MIN_EDGE
 _MAX_SHIFT = 5  # samples between views of a static outline, because panoramas are levelled after capture
 _OUTLINE_BAND = 5  # samples on both sides of the outline that are compared
 _SURROUNDINGS = 10, 30  # samples from the outline to the inner and outer edge of the surroundings
@@ -46,7 +46,7 @@ _MAX_AROUND = 0.6  # largest correlation of an outline's surroundings, relative 
 _MIN_PAIRS = 0.6  # fraction of the pairs of views that must agree; one view with glare spoils two pairs of five
 _MIN_VIEWS_FOR_LEGS = 4  # with fewer panoramas too many edges are static by chance
 _LEG_RADIUS, _LEG_SHIFT, _LEG_GAP = 5, 5, 7  # samples: half thickness, shift between views, largest interruption
-_LEG_CONTRAST = 0.045  # grey difference to the floor
+_LEG_CONTRAST = 0.045  # least grey difference of a leg to the floor
 _REGION_MARGIN = 3  # samples added around the region, because its edge is blurred
 _LEAST_COLOR = 1e-6  # value in [0, 1] that black surfaces get, which are no holes then; less than any display shows
 

@@ -81,7 +81,7 @@ def find_stated_problem(xmp: bytes, width: int, height: int) -> str | None:
     to do; None if they state nothing else, or contradict the picture.
 
     Args:
-        width, height: of the picture, pixels; it may have been resized.
+        width, height: the picture's, pixels; it may have been resized.
     """
     tags = {name: attribute or element for name, attribute, element in _TAG.findall(xmp.decode("utf-8", "replace"))}
     projection = tags.get("ProjectionType", "equirectangular").strip()
@@ -173,10 +173,5 @@ def _edit(content: bytes, *kinds: bytes, change: Callable[[bytes], bytes]) -> by
     return b"".join(parts)
 
 
-def _make_projection(content: bytes) -> bytes:
-    """The box `sv3d` with a projection that is not turned."""
-    header = _box(b"prhd", bytes(4) + bytes(12))
-    return _box(b"sv3d", _box(b"svhd", bytes(4) + b"pansplat\0") + _box(b"proj", header + content))
-
-
-_SPHERICAL_V2 = _make_projection(_box(b"equi", bytes(4) + bytes(16)))  # bounds of 0: the panorama is not cropped
+_PROJECTION = _box(b"prhd", bytes(16)) + _box(b"equi", bytes(20))  # it is not turned, and the panorama is not cropped
+_SPHERICAL_V2 = _box(b"sv3d", _box(b"svhd", bytes(4) + b"pansplat\0") + _box(b"proj", _PROJECTION))

@@ -13,21 +13,21 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from msgspec import Meta
 from numpy import ndarray as Array
 
-from pansplat.errors import InputError
 from pansplat.geometry.cubemap import face_rotations
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.cube_images import DENSITY, LARGEST_DENSITY, Decode, equirect_from_faces, write_description
-from pansplat.system.strict_json import read_json
 
 RIG_SUFFIX = ".rig.json"
 
+_Row = tuple[float, float, float]
 _SAMPLES = 2  # samples per pixel and axis
 _CUBE_TOLERANCE = 1e-4  # deviation of a cube's faces: radians, and relative to half a face
 _EDGE_MARGIN = 0.5  # pixels outside a picture that count as covered, because of rounding at common edges
@@ -43,12 +43,12 @@ class Lens:
         width, height: pixels.
     """
 
-    fx: float
-    fy: float
+    fx: Annotated[float, Meta(gt=0)]
+    fy: Annotated[float, Meta(gt=0)]
     cx: float
     cy: float
-    width: int
-    height: int
+    width: Annotated[int, Meta(gt=0)]
+    height: Annotated[int, Meta(gt=0)]
 
     def scaled(self, width: int, height: int) -> Lens:
         """The camera of the picture at another size."""
@@ -68,7 +68,7 @@ class RigView:
     """
 
     file: Path
-    rotation: tuple[tuple[float, ...], ...]
+    rotation: tuple[_Row, _Row, _Row]
     lens: Lens
     mask: Path | None = None
 
@@ -77,7 +77,7 @@ class RigView:
 class RigImage:
     """A panorama of perspective pictures."""
 
-    views: tuple[RigView, ...]
+    views: Annotated[tuple[RigView, ...], Meta(min_length=1)]
 
     @property
     def height(self) -> int:
@@ -208,36 +208,8 @@ def _remap(
 
 def write_rig(rig: RigImage, folder: Path, name: str) -> Path:
     """Write the file that stands for a rig; see `pansplat.images.cube_images.write_description`."""
-    views = [
-        {
-            "file": str(view.file.absolute()),
-            "rotation": view.rotation,
-            "lens": dataclasses.astuple(view.lens),
-            "mask": None if view.mask is None else str(view.mask.resolve()),
-        }
+    views = (
+        dataclasses.replace(view, file=view.file.absolute(), mask=view.mask and view.mask.resolve())
         for view in rig.views
-    ]
-    return write_description({"views": views}, rig.list_files(), folder, name + RIG_SUFFIX)
-
-
-def read_rig(path: Path) -> RigImage:
-    """The rig that a file of `write_rig` stands for."""
-    content = read_json(path, dict[str, Any])
-    try:
-        views = tuple(_read_view(view) for view in content["views"])
-        if not views:
-            raise ValueError
-        return RigImage(views)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: needed a description of perspective pictures, got another content; delete the file."
-        ) from error
-
-
-def _read_view(content: dict[str, Any]) -> RigView:
-    fx, fy, cx, cy, width, height = content["lens"]
-    rotation = tuple(tuple(map(float, row)) for row in content["rotation"])
-    lens = Lens(float(fx), float(fy), float(cx), float(cy), int(width), int(height))
-    if np.shape(rotation) != (3, 3) or not (min(lens.fx, lens.fy) > 0 and min(lens.width, lens.height) > 0):
-        raise ValueError
-    return RigView(Path(content["file"]), rotation, lens, None if content["mask"] is None else Path(content["mask"]))
+    )
+    return write_description(RigImage(tuple(views)), folder, name + RIG_SUFFIX)

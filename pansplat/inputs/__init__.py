@@ -1,1 +1,1 @@
-"""Folders of panoramas with and without poses, reconstructions and web tours as `Pair` and `Collection`."""
+"""Folders of panoramas with and without poses, reconstructions and web tours as `PanoramaSet` and `Collection`."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pansplat.images.image_files import list_masks
 from pansplat.images.masks import sample_files
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import hash_file, hash_parts
 
@@ -36,8 +36,8 @@ def hash_pixels(panoramas: Iterable[Panorama], siblings: tuple[Path, ...]) -> st
     return hash_parts(_hash_code(), json.dumps([stated, others]))
 
 
-def hash_context(pair: Pair) -> str:
-    """A hash of all that `Pair.load_context` depends on, besides the height."""
+def hash_context(pair: PanoramaSet) -> str:
+    """A hash of all that `PanoramaSet.load_context` depends on, besides the height."""
     poses = [view.cam2world.tolist() for view in pair.context]
     return hash_parts(hash_pixels(pair.context, pair.siblings), json.dumps([poses, pair.near, pair.far]))
 
@@ -58,4 +58,4 @@ def hash_panorama(panorama: Panorama) -> str:
 @cache
 def _hash_code() -> str:
     """A hash of the code that reads panoramas."""
-    return hash_parts(hash_sources("pansplat.inputs.pairs"), PIL.__version__, cv2.__version__)
+    return hash_parts(hash_sources("pansplat.inputs.panorama_sets"), PIL.__version__, cv2.__version__)

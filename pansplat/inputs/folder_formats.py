@@ -20,7 +20,7 @@ from msgspec import Meta, Struct
 from torch import Tensor
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.inputs.pairs import (
+from pansplat.inputs.panorama_sets import (
     FAR,
     FAR_SEQUENCE,
     MAX_CONTEXT,
@@ -194,10 +194,10 @@ def _read_pose_entry(
     """One entry of poses.json.
 
     Args:
-        folder: of the file.
-        name: of the entry.
+        folder: the folder of poses.json.
+        name: the key of the entry.
         entry: its value.
-        convention: of the pose.
+        convention: that of the pose.
         is_stated: whether `convention` comes from the file.
         view: what a web tour states of the panorama; None for a file.
     """
@@ -327,10 +327,15 @@ def read_panogrf_scene(source: Path, folder: Path, convention: str | None = None
     """
     convention = convention or "cam2world opengl"
     views = dict.fromkeys(file.parent for file in list_panogrf_files(source))
-    panoramas = tuple(_read_view_folder(view, folder, convention) for view in views)
+    panoramas = [_read_view_folder(view, folder, convention) for view in views]
+    return _join_ends(source, folder, panoramas, folder.resolve().name)
+
+
+def _join_ends(source: Path, folder: Path, panoramas: Sequence[Panorama], name: str) -> Collection:
+    """The first and the last panorama as the context, and those between as targets."""
     last = len(panoramas) - 1
     groups = (((0, last), tuple(range(1, last))),) if last > 0 else None
-    return Collection(source, folder, panoramas, groups, name=folder.resolve().name)
+    return Collection(source, folder, tuple(panoramas), groups, name=name)
 
 
 def _read_view_folder(view: Path, folder: Path, convention: str) -> Panorama:
@@ -380,8 +385,7 @@ def read_triplet(source: Path, folder: Path, convention: str | None = None) -> C
         cam2world = to_cam2world(rigid_matrix(matrix, f"{source}, pose {i}"), convention or "cam2world opencv")
         mask = find_mask(image, folder)
         panoramas.append(Panorama(image.stem, image, cam2world, mask, depth if depth.is_file() else None))
-    last = len(panoramas) - 1
-    return Collection(source, folder, tuple(panoramas), (((0, last), tuple(range(1, last))),), name=source.stem)
+    return _join_ends(source, folder, panoramas, source.stem)
 
 
 # Sequences of frames: a 360Loc camera_pose.json (docs/official.md, section 2.2).

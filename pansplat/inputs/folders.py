@@ -1,4 +1,4 @@
-"""Panoramas at a path: `load_pairs` searches folders for those of a known format and reads them (docs/input.md)."""
+"""Panoramas at a path: `load_sets` searches folders for those of a known format and reads them (docs/input.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from pansplat.images.blur_masks import MASK_SUFFIX, fold_name, list_folders_once
 from pansplat.images.image_files import READABLE_SUFFIXES, list_masks, list_pictures, require_panorama
 from pansplat.inputs.folder_formats import PAIRS, POSES
 from pansplat.inputs.formats import FORMATS, PHOTOGRAPHS, POSED, TRIPLETS, WEB_TOURS, Format
-from pansplat.inputs.pairs import Collection, Pair, Panorama, list_names, list_panorama_files, localize_pairs
+from pansplat.inputs.panorama_sets import (
+    Collection,
+    Panorama,
+    PanoramaSet,
+    list_names,
+    list_panorama_files,
+    localize_sets,
+)
 from pansplat.inputs.photographs import LINKS, add_links, list_unread_panoramas
 from pansplat.inputs.poses import parse_convention
 from pansplat.inputs.web_tours import find_web_tours, is_web_tour_file
@@ -33,40 +40,40 @@ _PICTURE_SUFFIXES = (*READABLE_SUFFIXES, ".bmp", ".gif")  # pictures that may be
 _MAX_DEPTH = 4  # levels of nested folders that are searched
 
 
-def load_pairs(
+def load_sets(
     path: Path | str,
     *,
     convention: str | None = None,
     near: float | None = None,
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
-) -> list[Pair]:
+) -> list[PanoramaSet]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
     Args:
         path: see `load_collections`.
         convention: pose convention, such as "world2cam opencv"; overrides that of the files.
         near, far: radial depth range in metres; overrides that of the files.
-        camera_height: of the cameras over the floor, metres.
+        camera_height: height of the cameras over the floor, metres.
 
     Raises:
         InputError: the folder or web tour holds two or more panoramas, and no poses.
     """
-    return make_pairs(load_collections(path, convention=convention), near, far, camera_height)
+    return make_sets(load_collections(path, convention=convention), near, far, camera_height)
 
 
-def make_pairs(
+def make_sets(
     collections: Sequence[Collection],
     near: float | None = None,
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
-) -> list[Pair]:
+) -> list[PanoramaSet]:
     """The pairs of collections, of unique names, those with targets first.
 
     Poses are in a world of metres around its origin; `Panorama.frame` states where it is in the world of the files.
     """
-    pairs = [pair for found in collections for pair in found.pairs(near, far)]
-    return localize_pairs(make_names_unique(sorted(pairs, key=lambda pair: not pair.targets)), camera_height)
+    pairs = [pair for found in collections for pair in found.sets(near, far)]
+    return localize_sets(make_names_unique(sorted(pairs, key=lambda pair: not pair.targets)), camera_height)
 
 
 @list_folders_once()
@@ -104,7 +111,7 @@ def require_known_masks(root: Path, panoramas: Iterable[Panorama] = ()) -> None:
     """Check that every mask is applied: another one would show what it should hide.
 
     Args:
-        root: a file, or a folder that is searched as by `load_pairs`.
+        root: a file, or a folder that is searched as by `load_sets`.
         panoramas: that were read there.
     """
     views = {view.image: view for view in panoramas}
@@ -361,7 +368,7 @@ def _advise_on_file(file: Path) -> str:
     return f"{file.name}, which the program of its camera must stitch; export it as a 2:1 JPG"
 
 
-def make_names_unique(pairs: list[Pair]) -> list[Pair]:
+def make_names_unique(pairs: list[PanoramaSet]) -> list[PanoramaSet]:
     """Prefix equal names with the folder's name, then append a number to names that are still equal."""
     counts = Counter(pair.name for pair in pairs)
     names = [p.name if counts[p.name] == 1 else f"{p.folder.resolve().name}_{p.name}" for p in pairs]

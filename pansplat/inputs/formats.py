@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pansplat.inputs import folder_formats as own
 from pansplat.inputs import photographs, web_tours
-from pansplat.inputs.pairs import Collection
+from pansplat.inputs.panorama_sets import Collection
 from pansplat.inputs.reconstructions import colmap, metashape, nerfstudio, openmvg, opensfm
 from pansplat.inputs.reconstructions.shots import Reconstruction, make_collection
 

@@ -18,7 +18,7 @@ from pansplat.images.cube_faces import group_faces
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
 from pansplat.images.image_files import is_two_to_one, list_pictures, require_panorama
 from pansplat.images.rig_images import RIG_SUFFIX
-from pansplat.inputs.pairs import MAX_NAMES, Collection, Link, Note, Panorama, list_panorama_files
+from pansplat.inputs.panorama_sets import MAX_NAMES, Collection, Link, Note, Panorama, list_panorama_files
 from pansplat.inputs.web_tours.entries import (
     Number,
     make_note,

@@ -24,7 +24,7 @@ class ApproximatePlace:
 
     Attributes:
         beside: picture of the panorama that it is relative to.
-        right, forward: of that camera, level, in the unit of its pose.
+        right, forward: distances from that camera, level, in the unit of its pose.
         yaw: heading, radians to the right of that camera's.
         by: names of the panoramas whose links state it.
         is_in_heights: whether right and forward are in heights of that camera, as no unit is stated.
@@ -72,10 +72,10 @@ def read_approximate(
 
     Args:
         images: by name.
-        units: of the poses that are known, by name (`read_unit`).
+        units: units of the poses that are known, by name (`read_unit`).
     """
     found = {}
-    for _, stated in list_approximate(estimate):
+    for _, stated in list_stated_places(estimate):
         beside, name = stated.between
         if beside in images and name in images and beside != name:
             unit, (right, forward, yaw) = units.get(beside), stated.place
@@ -84,7 +84,7 @@ def read_approximate(
     return found
 
 
-def list_approximate(estimate: Any) -> list[tuple[dict[str, Any], StatedPlace]]:
+def list_stated_places(estimate: Any) -> list[tuple[dict[str, Any], StatedPlace]]:
     """The valid entries of the approximate places that an estimate states, and what they state."""
     entries, found = estimate.get("approximate") if isinstance(estimate, Mapping) else None, []
     for entry in entries if isinstance(entries, list) else []:

@@ -61,7 +61,7 @@ class DepthSharpening(RoomNetwork):
 
         Args:
             images: RGB in [0, 1]; 32 divides their height.
-            estimate: of the same panoramas by the depth network, at any size.
+            estimate: the depth network's estimate of the same panoramas, at any size.
         """
         x, encoded = self.encode_room(images)
         known = torch.stack((estimate.log_depth - MEAN_LOG_DEPTH, estimate.log_scale), dim=1).float()

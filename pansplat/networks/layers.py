@@ -138,7 +138,7 @@ class ConvNorm(nn.Module):
     """Convolution, normalisation and an activation.
 
     Args:
-        groups: of the normalisation; 0 to normalise batches.
+        groups: number of groups of the normalisation; 0 to normalise batches.
         activate: the activation; None for none.
     """
 

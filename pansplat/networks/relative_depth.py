@@ -30,7 +30,7 @@ class RelativeDepthNetwork:
 
     Args:
         session: an `onnxruntime.InferenceSession`, or an object with its `get_inputs` and `run`.
-        name: of the file, for messages.
+        name: name of the file, for messages.
         fingerprint: changes with the file.
 
     Raises:

@@ -10,8 +10,8 @@ from pansplat.pipeline.drawing import Drawing, make_renderer, render
 from pansplat.pipeline.models import can_stream, load_model, load_predictor
 from pansplat.pipeline.prediction import (
     fuse,
-    load_pairs,
     load_photographs,
+    load_sets,
     predict,
     predict_to_file,
     refine,

@@ -20,7 +20,8 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.devices import choose_device, note_full_card
-from pansplat.tours.graph import make_graph
+from pansplat.tours.merge import make_graph
+from pansplat.tours.scene_views import choose_scene_views
 
 Drawing = Literal["exact", "original"]
 
@@ -82,17 +83,17 @@ def render(
         return rasterize_gaussians(scene.gaussians.select(scene.gaussians.views == blend), pose)
     if blend not in ("deferred", "joint"):
         raise InputError(f"`blend` must be deferred, joint or the number of a view, got {blend!r}")
-    tour = make_graph(scene) if scene.overlaps else None
-    edge = None if tour is None else tour.find_nearest_edge(pose[:3, 3].detach().cpu().numpy())[0]
-    shown = list(range(num_views))
-    if tour is not None and edge is not None:
+    shown = group = list(range(num_views))
+    if scene.tour:
+        tour = make_graph(scene)
+        edge, _ = tour.find_nearest_edge(pose[:3, 3].detach().cpu().numpy())
         shown = [view for view in shown if not tour.is_fade(view, edge[0])]
+        group = list(choose_scene_views(tour)[edge])
     if blend == "joint" or num_views < 2:
         gaussians = scene.gaussians
         if len(shown) < num_views:
             gaussians = gaussians.select(torch.isin(gaussians.views, torch.tensor(shown).to(gaussians.views)))
         return rasterize_gaussians(gaussians, pose)
-    group = shown if tour is None or edge is None else list(tour.choose_scene_views()[edge])
     weights = torch.zeros(num_views, dtype=torch.float64, device=pose.device)
     near = torch.tensor(group, device=pose.device)
     forward = pose[:3, 2] if layout == "pinhole" else None

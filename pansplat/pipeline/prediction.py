@@ -20,10 +20,10 @@ from pansplat.gaussians.formats import save_scene
 from pansplat.gaussians.ply import save_ply_parts
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians, prune
 from pansplat.inputs import folders
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import ONE_POSITION, Views
 from pansplat.pipeline.models import can_stream, find_min_views, load_predictor
-from pansplat.poses.files import estimate_pairs
+from pansplat.poses.files import estimate_sets
 from pansplat.prediction_options import PredictOptions, choose_caches
 from pansplat.predictor import Predictor
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement, RefineReport, fuse_views
@@ -34,7 +34,8 @@ from pansplat.system.devices import choose_device, note_full_card, with_device
 from pansplat.system.files import find_scene_suffix
 from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
 from pansplat.system.progress import POSED, report_progress, stage
-from pansplat.tours.graph import find_tours, list_starts
+from pansplat.tours.graph import find_tours
+from pansplat.tours.merge import list_starts
 
 _DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
 _MAX_CACHED_HEIGHT = 512  # rows of a network's prediction that is cached; taller ones are written tile by tile
@@ -46,15 +47,15 @@ _STEP_SECONDS = 0.25  # time of a step on two cores, photographs of 512 rows
 
 @with_device
 @with_progress_bar
-def load_pairs(
+def load_sets(
     path: Path | str,
     *,
     convention: str | None = None,
     near: float | None = None,
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
-    on_unposed: Callable[[list[Pair]], None] | None = None,
-) -> list[Pair]:
+    on_unposed: Callable[[list[PanoramaSet]], None] | None = None,
+) -> list[PanoramaSet]:
     """The pairs at a path, those with targets first. Image files are read when a pair is loaded.
 
     The poses of a folder that holds panoramas only are estimated (docs/poses.md), with a warning, and cached. A
@@ -75,11 +76,11 @@ def load_pairs(
     if collections[0].needs_poses:
         folder, panoramas = collections[0].folder, collections[0].unposed
         options = {"near": near, "far": far, "camera_height": camera_height}
-        return estimate_pairs(folder, panoramas, **options, on_unposed=on_unposed)
-    return folders.make_pairs(collections, near, far, camera_height)
+        return estimate_sets(folder, panoramas, **options, on_unposed=on_unposed)
+    return folders.make_sets(collections, near, far, camera_height)
 
 
-def choose_height(pair: Pair, predictor: Predictor) -> int:
+def choose_height(pair: PanoramaSet, predictor: Predictor) -> int:
     """The height to predict a pair at: that of its photographs, at most the largest default of the predictor."""
     return max(MIN_HEIGHT, min(pair.image_height, getattr(predictor, "default_height", _DEFAULT_HEIGHT)))
 
@@ -87,7 +88,7 @@ def choose_height(pair: Pair, predictor: Predictor) -> int:
 @with_device
 @with_progress_bar
 def predict(
-    source: Pair | Views | str | Path,
+    source: PanoramaSet | Views | str | Path,
     model: str | Path | Predictor | None = None,
     *,
     options: PredictOptions | None = None,
@@ -121,7 +122,7 @@ def predict(
 @with_device
 @with_progress_bar
 def predict_to_file(
-    source: Pair | Views | str | Path,
+    source: PanoramaSet | Views | str | Path,
     path: str | Path,
     model: str | Path | Predictor | None = None,
     *,
@@ -261,7 +262,7 @@ def choose_refine_steps(views: int, *, joint: bool = False) -> int:
     return max(_JOINT_STEPS, _MIN_STEPS * views) if joint else _REFINE_STEPS
 
 
-def load_photographs(pair: Pair, height: int) -> Views:
+def load_photographs(pair: PanoramaSet, height: int) -> Views:
     """The context panoramas for the refinement of a scene of a height: with twice its rows, at most `DISPLAY_HEIGHT`.
 
     Those of the prediction do not show detail, and the gaps between Gaussians, that larger pictures show.
@@ -273,7 +274,7 @@ def load_photographs(pair: Pair, height: int) -> Views:
 class _Task:
     """What is predicted and how; `options` has no defaults that are still to be chosen."""
 
-    source: Pair | Views
+    source: PanoramaSet | Views
     predictor: Predictor
     options: PredictOptions
 
@@ -305,7 +306,7 @@ def choose_options(
 
 
 def _prepare(
-    source: Pair | Views | str | Path,
+    source: PanoramaSet | Views | str | Path,
     model: str | Path | Predictor | None,
     options: PredictOptions | None,
     keywords: dict[str, Any],
@@ -380,17 +381,17 @@ def _predict_views(task: _Task) -> Scene:
     return _make_scene(content, task)
 
 
-def _load_source(source: Pair | Views | str | Path) -> Pair | Views:
+def _load_source(source: PanoramaSet | Views | str | Path) -> PanoramaSet | Views:
     """The pair of a path; a pair or views as they are, with tensors in place of arrays."""
     if isinstance(source, (str, Path)):
-        pairs = load_pairs(source)
+        pairs = load_sets(source)
         if len(pairs) == 1:
             return pairs[0]
         names = ", ".join(pair.name for pair in pairs[:8]) + (", ..." if len(pairs) > 8 else "")
         every = ", or all in one scene: predict_tour(path)" if len(find_tours(pairs)) == 1 else ""
-        advice = f"choose one: predict(load_pairs(path)[0]){every}"
+        advice = f"choose one: predict(load_sets(path)[0]){every}"
         raise InputError(f"{source} holds {len(pairs)} pairs ({names}); {advice}")
-    if isinstance(source, Pair):
+    if isinstance(source, PanoramaSet):
         return source
     if isinstance(source, Views):
         return _as_tensors(source)
@@ -413,7 +414,7 @@ def _as_tensors(views: Views) -> Views:
 
 def _make_scene(content: CachedScene, task: _Task, joint: bool = False) -> Scene:
     source, gaussians, cam2world = task.source, content.gaussians, task.cam2world.double()
-    panoramas = source.context if isinstance(source, Pair) else ()
+    panoramas = source.context if isinstance(source, PanoramaSet) else ()
     first = source if isinstance(source, Views) else source.context[0]
     if len(cam2world) == 1:  # it is predicted as if the camera stood at the usual height
         gaussians = gaussians.scaled(first.camera_height / CAMERA_HEIGHT, cam2world[0, :3, 3])

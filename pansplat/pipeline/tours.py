@@ -13,9 +13,9 @@ import torch
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.pipeline.models import find_min_views, load_model
-from pansplat.pipeline.prediction import choose_options, choose_refine_steps, fuse, load_pairs, predict, refine_scene
+from pansplat.pipeline.prediction import choose_options, choose_refine_steps, fuse, load_sets, predict, refine_scene
 from pansplat.prediction_options import PredictOptions, choose_caches
 from pansplat.predictor import Predictor
 from pansplat.refinement import fuse_views
@@ -23,8 +23,10 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import with_device
 from pansplat.system.options import MIN_HEIGHT
 from pansplat.system.progress import CONNECTED, POSED, stage
-from pansplat.tours.graph import MAX_SCENE_VIEWS, TourGraph, find_tours, merge_scenes, select_views
+from pansplat.tours.graph import TourGraph, find_tours
+from pansplat.tours.merge import merge_scenes, select_views
 from pansplat.tours.overlap import connect
+from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_scene_views, choose_sources
 
 _TOUR_HEIGHT = 512  # largest default height of the panoramas of a tour, which has many scenes
 _GAUSSIANS_PER_SQUARE = 0.75  # Gaussians of a panorama over the square of its rows; about those of the default model
@@ -59,13 +61,13 @@ def predict_tour(
             tour = _load_only_tour(tour)
     warn_of_single_views(tour, predictor)
     max_views, is_refined = find_max_views(predictor), options.joint and options.refine_steps != 0
-    total = len(tour.choose_sources(max_views))
+    total = len(choose_sources(tour, max_views))
     part = math.inf if options.gaussians is None else options.gaussians / len(tour)  # limit of Gaussians of a panorama
     counter = itertools.count(1)
     each = replace(options, joint=False, refine_steps=0) if options.joint else options
 
     def predict_scene(views: tuple[int, ...]) -> Scene:
-        number, pair = next(counter), tour.make_pair(views)
+        number, pair = next(counter), tour.make_set(views)
         fitted = fit_to_scene(each, pair, part)
         with stage(number / total, f"scene {number} of {total}: "):
             return predict(pair, choose_predictor(pair, predictor), options=fitted)
@@ -85,7 +87,7 @@ def _fuse_tour(tour: TourGraph, scene: Scene, refine_steps: int | None) -> Scene
     for number, nodes in enumerate(parts, 1):
         part = select_views(scene, nodes)
         if len(nodes) > 1:
-            pair = tour.make_pair(nodes)
+            pair = tour.make_set(nodes)
             views = replace(pair.load_context(scene.height), cam2world=part.cam2world, frame=part.frame)
             steps = choose_refine_steps(len(nodes), joint=True) if refine_steps is None else refine_steps
             if steps:
@@ -99,14 +101,14 @@ def _fuse_tour(tour: TourGraph, scene: Scene, refine_steps: int | None) -> Scene
     return replace(scene, gaussians=Gaussians.cat(fused), gains=tuple(gains), joint=True)
 
 
-def choose_predictor(pair: Pair, predictor: Predictor) -> Predictor:
+def choose_predictor(pair: PanoramaSet, predictor: Predictor) -> Predictor:
     """The predictor of a scene of a tour: `default` for a single view if the given one needs two or more views."""
     return predictor if len(pair.context) >= find_min_views(predictor) else load_model()
 
 
 def warn_of_single_views(tour: TourGraph, predictor: Predictor) -> None:
     """Warn if `choose_predictor` replaces the predictor in some scenes of a tour."""
-    count = sum(len(views) == 1 for views in set(tour.choose_scene_views().values()))
+    count = sum(len(views) == 1 for views in set(choose_scene_views(tour).values()))
     if count and find_min_views(predictor) > 1:
         warnings.warn(
             f"{tour.name}: {count} single view{'s are' if count > 1 else ' is'} predicted by default, because "
@@ -121,14 +123,14 @@ def find_max_views(predictor: Predictor) -> int:
     return getattr(predictor, "max_views", MAX_SCENE_VIEWS)
 
 
-def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.inf) -> PredictOptions:
+def fit_to_scene(options: PredictOptions, pair: PanoramaSet, gaussians: float = math.inf) -> PredictOptions:
     """The options of a scene of a tour, from those of the tour.
 
     The height, by default that of the photographs, at most 512, is halved while the prediction has more than four times
     as many Gaussians as are kept: a refinement after a few mergers fits the photographs better than after many.
 
     Args:
-        pair: of `TourGraph.make_pair`.
+        pair: of `TourGraph.make_set`.
         gaussians: number that is kept of each panorama.
     """
     height = options.height
@@ -142,10 +144,10 @@ def fit_to_scene(options: PredictOptions, pair: Pair, gaussians: float = math.in
 
 def _load_only_tour(path: str | Path) -> TourGraph:
     with stage(POSED):
-        tours = find_tours(load_pairs(path))
+        tours = find_tours(load_sets(path))
     if len(tours) != 1:
         names = f" ({', '.join(tour.name for tour in tours[:8])}{', ...' if len(tours) > 8 else ''})" if tours else ""
-        advice = "give its folder" if tours else "predict one pair: predict(load_pairs(path)[0])"
+        advice = "give its folder" if tours else "predict one pair: predict(load_sets(path)[0])"
         raise InputError(f"{path}: needed the panoramas of one tour, got {len(tours)} tours{names}; {advice}")
     with stage(CONNECTED):
         return connect(tours[0])

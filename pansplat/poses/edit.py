@@ -24,8 +24,8 @@ from pansplat.images.blur_masks import locate_panorama
 from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled
 from pansplat.inputs.folder_formats import MATRIX_KEYS
-from pansplat.inputs.pairs import Panorama
-from pansplat.inputs.placements import BY_HAND, list_approximate, read_unit
+from pansplat.inputs.panorama_sets import Panorama
+from pansplat.inputs.placements import BY_HAND, list_stated_places, read_unit
 from pansplat.inputs.poses import from_cam2world, parse_convention, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.inputs.web_tours import is_scene_of_tour
@@ -213,7 +213,7 @@ def merge_estimate(
     content["estimate"] = {
         **old,
         **fresh,
-        "approximate": [entry for entry, stated in list_approximate(old) if not set(stated.between) <= read]
+        "approximate": [entry for entry, stated in list_stated_places(old) if not set(stated.between) <= read]
         + fresh["approximate"],
         "unplaced": {name: reason for name, reason in unplaced if name not in files} | fresh["unplaced"],
         "written": " ".join(mark for world, mark in mark_worlds(content).items() if world in own),

@@ -18,7 +18,7 @@ from numpy import ndarray as Array
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_mask, read_panorama
 from pansplat.images.masks import scene_mask_of_files
-from pansplat.inputs.pairs import FAR, NEAR, find_mask
+from pansplat.inputs.panorama_sets import FAR, NEAR, find_mask
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.approximate import LinkedPlace, place_linked
 from pansplat.poses.axes import NO_PRIOR, RotationPrior, SceneAxes, find_axes

@@ -16,7 +16,7 @@ from pansplat.images.cube_images import CUBE_SUFFIX
 from pansplat.images.image_files import is_assembled, read_thumbnail
 from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.folders import make_names_unique
-from pansplat.inputs.pairs import Collection, Pair, Panorama, localize_pairs, single_view_pairs
+from pansplat.inputs.panorama_sets import Collection, Panorama, PanoramaSet, localize_sets, single_view_sets
 from pansplat.inputs.placements import Placement, read_approximate
 from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.views import CAMERA_HEIGHT
@@ -104,15 +104,15 @@ def _name_for_people(panoramas: Sequence[Panorama]) -> dict[Path, str]:
     }
 
 
-def estimate_pairs(
+def estimate_sets(
     folder: Path,
     panoramas: Sequence[Panorama],
     *,
     near: float | None = None,
     far: float | None = None,
     camera_height: float = CAMERA_HEIGHT,
-    on_unposed: Callable[[list[Pair]], None] | None = None,
-) -> list[Pair]:
+    on_unposed: Callable[[list[PanoramaSet]], None] | None = None,
+) -> list[PanoramaSet]:
     """The pairs of panoramas without poses; the outcome of the estimate is cached like predictions.
 
     Panoramas that are placed together have one world. Each other one has a world of its own, a pair of a single view,
@@ -131,13 +131,13 @@ def estimate_pairs(
     content = store.read(_KIND, key)
     if content is None:
         if on_unposed is not None:
-            single = single_view_pairs(panoramas, folder, near, far, siblings=panoramas)
-            on_unposed(localize_pairs(make_names_unique(single), camera_height))
+            single = single_view_sets(panoramas, folder, near, far, siblings=panoramas)
+            on_unposed(localize_sets(make_names_unique(single), camera_height))
         content = _estimate(folder, panoramas, camera_height)
         store.write(_KIND, key, content)
     source = next(iter(store.find(_KIND, key)), None)  # None if no folder at all can be written
     pairs = _make_pairs(folder, panoramas, content, source, near, far)
-    return localize_pairs(make_names_unique(pairs), camera_height)
+    return localize_sets(make_names_unique(pairs), camera_height)
 
 
 def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def _make_pairs(
     source: Path | None,
     near: float | None,
     far: float | None,
-) -> list[Pair]:
+) -> list[PanoramaSet]:
     """The pairs of an estimate, with its warnings."""
     by_name = {panorama.name: panorama for panorama in panoramas}
     worlds, stated, unreadable = content["worlds"], content["estimate"], content["unreadable"]
@@ -192,7 +192,7 @@ def _make_pairs(
     for views, world in zip(posed, worlds, strict=True):
         only = folder.resolve().name if len(views) == 2 else None
         found = Collection(source or folder, folder, tuple(views), near=world["near"], far=world["far"], name=only)
-        pairs += found.pairs(near, far)
+        pairs += found.sets(near, far)
     units = {view.name: world["unit"] for views, world in zip(posed, worlds, strict=True) for view in views}
     about = read_approximate(stated, {name: view.image for name, view in by_name.items()}, units)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
@@ -202,7 +202,7 @@ def _make_pairs(
         for view in readable
         if view.name in reasons
     ]
-    return pairs + single_view_pairs(single, folder, near, far, siblings=readable, first_world=len(worlds))
+    return pairs + single_view_sets(single, folder, near, far, siblings=readable, first_world=len(worlds))
 
 
 def _describe(panorama: Panorama, folder: Path) -> str:

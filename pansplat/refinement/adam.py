@@ -59,8 +59,8 @@ class ParameterGroup:
         """Move the parameters that have a gradient.
 
         Args:
-            factor: of the step size.
-            rows: mask of the rows of each parameter that move; all by default. Others keep their averages, whose
+            factor: factor of the step size.
+            rows: mask of the rows of each parameter that move; all by default. Other rows keep their averages, whose
                 momentum would move a Gaussian for many steps after the last one that saw it.
         """
         moved = [parameter for parameter in self.parameters if parameter.grad is not None]

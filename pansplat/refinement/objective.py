@@ -18,7 +18,7 @@ from torch.nn import functional
 from pansplat.geometry.equirect import pixel_directions, row_weights, sample_equirect, uv_from_directions
 from pansplat.rendering import Rendering
 
-_BLOCK_ROWS = 32  # most rows of blocks of a photograph, some of which are held out
+_BLOCK_ROWS = 32  # largest number of rows of blocks of a photograph; some blocks are held out
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +47,9 @@ class Photograph:
     """A photograph, and weights of its pixels.
 
     Attributes:
-        unmasked: of all pixels that are compared.
-        fitted: of those that are not held out.
-        held_out: of those that are.
+        unmasked: weights of all pixels that are compared.
+        fitted: weights of the pixels that are not held out.
+        held_out: weights of the pixels that are held out.
     """
 
     image: Float[Tensor, "3 height width"]
@@ -101,8 +101,8 @@ def compare_places(
 
     Args:
         drawn: the panorama.
-        pose: of its camera.
-        photographs: each of `Photograph.shrink` at the panorama's size, with its pose.
+        pose: pose of the panorama's camera.
+        photographs: results of `Photograph.shrink` at the panorama's size, each with its pose.
 
     Returns:
         The least mean absolute difference from a photograph, and the solid angle of each pixel, which is 0 without a

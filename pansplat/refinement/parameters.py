@@ -42,7 +42,7 @@ class ViewParameters:
     of distance keeps its size in the source view.
 
     Args:
-        gaussians: of the view; at least one.
+        gaussians: the view's Gaussians; at least one.
         camera: position of the source camera, metres.
         baseline: distance of the nearest other camera whose Gaussians are drawn together with them, metres; 0 without.
 

@@ -95,7 +95,7 @@ class RefineReport:
     """Result of a run.
 
     Attributes:
-        steps, seconds: of the run.
+        steps, seconds: number of steps of the run, and its duration.
         kept: steps of the state that is kept; 0 for the given scene.
         stopped: why it ended: "done", "converged", "interrupted", "time limit", "single view", which is not refined, or
             why the given scene is kept: "worse", or "torn" between the cameras.
@@ -132,7 +132,7 @@ class Refinement:
         views: the photographs that the scene was predicted from, of any size. Masked pixels and the holes of scans are
             not compared.
         config: settings.
-        seed: of the choice of held-out blocks.
+        seed: seed of the choice of held-out blocks.
     """
 
     @torch.inference_mode(False)  # the parameters need gradients, whatever the mode of the caller
@@ -204,7 +204,7 @@ class Refinement:
         """Rasterise and compare each view once, or in joint drawing all views, and move the Gaussians.
 
         Args:
-            fraction: of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
+            fraction: progress of the run, in [0, 1]; sets the step sizes, and whether held-out blocks are fitted.
         """
         config = self.config
         if self._splits < len(config.splits) and config.splits[self._splits] <= fraction < _RELEASE_AT:
@@ -252,7 +252,7 @@ class Refinement:
     def _find_seen(self, layer: _Layer) -> list[Tensor]:
         """Masks of a layer's Gaussians that each photograph shows. The others are not drawn: those of other rooms."""
         if not self._seen:
-            gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # for a quarter of the time
+            gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # a quarter of the pixels
             for target in layer.photographs:
                 weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), size)
                 everywhere = torch.ones(1, *size, device=gaussians.means.device)

@@ -21,7 +21,6 @@ from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphe
 
 _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the field is the median of all pixels
 
-
 # Evidence
 _AGREEING_DEPTH = 0.03  # relative difference of depth up to which two surfaces agree; evidence ends at twice of it
 _MAX_DIFFERENCE = 0.12  # mean difference of colour of 5x5 pixels above which a match is no evidence
@@ -32,9 +31,8 @@ _SMOOTHNESS = (1e5, 3e3, 300.0, 30.0, 3.0)  # coupling of neighbouring pixels, i
 _STIFFNESS = (0.0, 0.01, 0.02, 0.04, 0.05)  # evidence at which a field has half of its amplitude
 _OUTLIER = (1.0, 0.6, 0.3, 0.15, 0.06)  # deviation in log-depth that halves the weight of a match; halls need the first
 _ITERATIONS = 2  # weightings of the matches by their deviation, for each field
-# Difference of log-depth between pixels that divides their coupling by e: of the single view, or of dense evidence for
-# the field, above a difference that is no discontinuity.
-_DISCONTINUITY, _EVIDENCE_SLOPE = 0.06, 0.02
+_DISCONTINUITY = 0.06  # difference of log-depth between neighbouring pixels that divides their coupling by e
+_EVIDENCE_SLOPE = 0.02  # difference of the field by dense evidence up to which neighbouring pixels are no discontinuity
 
 
 def bend_surfaces(
@@ -99,7 +97,7 @@ def fit_field(
     Args:
         target: its value by the match of each pixel.
         evidence: weights of the matches.
-        log_depth: of the single view.
+        log_depth: logarithm of the single view's depth.
     """
     height = len(target)
     area = row_weights(height).numpy()[:, None] / row_weights(height).numpy().max()

@@ -58,8 +58,8 @@ def join_crops(
     Args:
         relative: inverse depth of the images of `crop_panorama`, along their optical axes, each of another scale and
             shift.
-        estimate: of the whole panorama, a batch of one.
-        height: of the result, pixels.
+        estimate: estimate of the whole panorama, a batch of one.
+        height: height of the result, pixels.
     """
     crops = [_normalise(crop.double()) for crop in relative]
     with one_thread():

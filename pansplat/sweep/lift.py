@@ -54,7 +54,7 @@ _MIN_DISTANCE = 0.5  # smallest distance of a Gaussian from an input camera, rel
 
 # Sizes of the Gaussians
 _FOOTPRINT = 0.7  # standard deviation of a disc, in lattice spacings
-_FINE_FOOTPRINT = 0.6  # the same on lattices finer than the surface
+_FINE_FOOTPRINT = 0.6  # standard deviation of a disc on a lattice finer than the surface, in lattice spacings
 _THICKNESS = 0.1  # standard deviation across the surface, relative to the disc's
 _MAX_STRETCH = (4.0, 4.0, 12.0, 24.0)  # largest ratio of a disc's long axis to its short one, by level
 _BACKGROUND_DEPTH = (1.02, 1.04)  # depth of levels 2 and 3 relative to the background

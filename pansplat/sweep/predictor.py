@@ -14,7 +14,7 @@ from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
 from pansplat.images.masks import mask_holes
-from pansplat.inputs.pairs import MAX_CONTEXT
+from pansplat.inputs.panorama_sets import MAX_CONTEXT
 from pansplat.predictor import require_matching_inputs, select_item
 from pansplat.rendering.color_fit import fit_colors
 from pansplat.sweep.lift import lift
@@ -35,7 +35,7 @@ class Sweep:
     """
 
     max_views = MAX_CONTEXT
-    """Of one prediction; each view is matched against a few others, so that time grows linearly with their number."""
+    """Largest number of views of a prediction, whose time grows linearly: a view is matched against a few others."""
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
 

@@ -80,11 +80,11 @@ class ObservedScene:
     """What the search is given.
 
     Attributes:
-        depths: of all hypotheses.
+        depths: range of the depths of all hypotheses.
         neighbours: the other views that each view is matched against, best first.
-        axes: (3, 3) of each view (`estimate_axes`).
-        priors: of each view; empty if nothing can be matched, because there is one view or all are at one place.
-        estimator: of the priors, and of the surfaces of single views; None without a prior model.
+        axes: axes (3, 3) of each view (`estimate_axes`).
+        priors: priors of each view; empty if nothing can be matched, because there is one view or all are at one place.
+        estimator: estimates the priors and the surfaces of single views; None without a prior model.
     """
 
     posed: PosedImages

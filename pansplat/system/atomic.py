@@ -39,15 +39,9 @@ def replacing(path: Path | str, *, failures: tuple[type[Exception], ...] = ()) -
         raise InputError(f"cannot write {path}: needed a file name, got {kind}; give another name")
     temporary = path.with_name(f".{path.stem[:_MAX_STEM]}.{secrets.token_hex(4)}{path.suffix}")
     try:
-        yield temporary
-        os.replace(temporary, path)
-    except InputError:
-        raise
-    except (OSError, *failures) as error:
-        reason = getattr(error, "strerror", None) or (str(error) or repr(error)).splitlines()[0]
-        raise InputError(
-            f"cannot write {path}: needed a writable folder with free disk space, got '{reason}'; choose another folder"
-        ) from error
+        with _naming(path, (OSError, *failures)):
+            yield temporary
+            os.replace(temporary, path)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -63,20 +57,28 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
     folder = Path(os.path.abspath(folder))
     temporary = folder.with_name(f".{folder.name[:_MAX_STEM]}.{secrets.token_hex(4)}")
     try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        if folder.is_dir():
-            folder.rmdir()
-        os.replace(temporary, folder)
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(
-            f"cannot write {folder}: needed a writable folder with free disk space, got '{error.strerror or error}'; "
-            "choose another folder"
-        ) from error
+        with _naming(folder, (OSError,)):
+            temporary.mkdir(parents=True)
+            yield temporary
+            if folder.is_dir():
+                folder.rmdir()
+            os.replace(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _naming(path: Path, failures: tuple[type[Exception], ...]) -> Iterator[None]:
+    """Raise an InputError that names the path in place of a failed write."""
+    try:
+        yield
+    except InputError:
+        raise
+    except failures as error:
+        reason = getattr(error, "strerror", None) or (str(error) or repr(error)).splitlines()[0]
+        raise InputError(
+            f"cannot write {path}: needed a writable folder with free disk space, got '{reason}'; choose another folder"
+        ) from error
 
 
 def is_unfinished(path: Path) -> bool:

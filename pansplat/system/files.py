@@ -1,4 +1,7 @@
-"""Checks of the files and folders that a user names, before anything is read, computed or written."""
+"""Checks of the files and folders that a user names, before anything is read, computed or written.
+
+The argument `option` is the option that error messages name, such as "--out"; `needed` what was needed.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,12 @@ from pansplat.errors import InputError
 
 # Suffixes of scene files; the first that fits a name is its format (pansplat.gaussians.formats).
 SCENE_SUFFIXES = (".compressed.ply", ".spz", ".splat", ".sog", ".glb", ".ply")
+
+PLY_TYPES = {  # numpy's codes of the types in headers of .ply files
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
 
 SOFTWARE = "software: pansplat"  # comment in every written file whose format has a place for one
 
@@ -70,12 +79,7 @@ def describe_kind(path: Path | str) -> str | None:
 
 
 def require_file(path: Path | str, needed: str = "a readable file") -> None:
-    """Check that a path is a regular file. Reading a FIFO or a device may never end.
-
-    Args:
-        path: the path, which error messages name.
-        needed: what was needed, for error messages.
-    """
+    """Check that a path is a regular file. Reading a FIFO or a device may never end."""
     try:
         kind = describe_kind(path)
     except FileNotFoundError as error:
@@ -102,12 +106,7 @@ def find_scene_suffix(path: Path | str) -> str:
 
 
 def read_file(path: Path | str, needed: str = "a readable file", *, limit: int | None = None) -> bytes:
-    """Content of a regular file.
-
-    Args:
-        path, needed: see `require_file`.
-        limit: largest size, bytes.
-    """
+    """Content of a regular file of at most `limit` bytes."""
     require_file(path, needed)
     try:
         with open(path, "rb") as file:
@@ -128,12 +127,7 @@ def expand_home(path: Path | str) -> Path:
 
 
 def require_output_folder(option: str, folder: Path) -> None:
-    """Check that a folder can be written, or made, before the work. Nothing is made.
-
-    Args:
-        option: the option that error messages name, such as "--out".
-        folder: the folder; it and its parents need not exist.
-    """
+    """Check that a folder can be written, or made with its parents, before the work. Nothing is made."""
     advice = "choose another folder"
     if reason := _find_system_problem(folder, errno.ENOENT):
         raise InputError(f"{option} {folder}: needed a folder to write into, got '{reason}'; {advice}")
@@ -149,12 +143,7 @@ def require_output_folder(option: str, folder: Path) -> None:
 
 
 def require_new_folder(option: str, folder: Path) -> None:
-    """Check that a folder can be made, before the work: it does not exist, or is empty.
-
-    Args:
-        option: the option that error messages name, such as "--out".
-        folder: the folder.
-    """
+    """Check that a folder can be made, before the work: it does not exist, or is empty."""
     require_output_folder(option, folder)
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{option} {folder}: needed a new or empty folder, got one with files; choose another name")
@@ -164,7 +153,6 @@ def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = (),
     """Check that a file can be written, before the work.
 
     Args:
-        option: the option that error messages name, such as "--out".
         path: the file; its folder must exist.
         suffixes: the allowed suffixes in lower case; any suffix by default.
         overwrite: see `require_replaceable`.
@@ -197,7 +185,6 @@ def require_replaceable(option: str, files: Iterable[Path], overwrite: bool | No
     """Check all files of a command before it writes the first: those that exist are empty, or pansplat wrote them.
 
     Args:
-        option: the option that error messages name, such as "--out".
         files: all that are written.
         overwrite: whether files of others may be replaced; None if there is no --overwrite.
     """

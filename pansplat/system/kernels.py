@@ -25,7 +25,6 @@ import torch
 
 from pansplat.system.numba_api import (
     find_cache_folder,
-    known_options,
     notify_of_compilation,
     set_source_stamp,
     share_literal_versions,
@@ -52,11 +51,9 @@ _cache_folder: Path | None = None  # folder of the compiled kernels; None withou
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function at its first call, to run without the interpreter lock, and cache the code on disk."""
-    compiled = cached_njit(**known_options(_OPTIONS))(function)
-    folder = find_cache_folder(compiled)
-    if folder is not None:
-        global _cache_folder
-        _cache_folder = Path(folder)
+    global _cache_folder
+    compiled = cached_njit(**_OPTIONS)(function)
+    _cache_folder = find_cache_folder(compiled) or _cache_folder
     return compiled
 
 
@@ -68,13 +65,13 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)  # the tests' annotation checks wrap every function
-        # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
-        stamp = hash_sources(function.__module__, (*_INLINED, _find_package(function.__module__)))
-        with contextlib.suppress(RuntimeError):  # no writable cache directory
+        try:
             compiled = nb.njit(cache=True, **options)(function)
-            if set_source_stamp(compiled, stamp):
-                return compiled
-        return nb.njit(**options)(function)
+        except RuntimeError:  # no writable cache directory
+            return nb.njit(**options)(function)
+        # Numba only checks the kernel's own file for changes; functions from other files are inlined into it.
+        set_source_stamp(compiled, hash_sources(function.__module__, (*_INLINED, _find_package(function.__module__))))
+        return compiled
 
     return decorate
 
@@ -94,8 +91,8 @@ def inline_kernel_no_refcount(function: Callable[..., Any]) -> Any:
 
 
 def _inline(function: Callable[..., Any], **options: Any) -> Any:
-    options = known_options({"forceinline": True, "no_cpython_wrapper": True, **options, **_OPTIONS})
-    compiled: Any = nb.njit(**options)(inspect.unwrap(function))
+    options |= {"forceinline": True, "no_cpython_wrapper": True}
+    compiled: Any = nb.njit(**options, **_OPTIONS)(inspect.unwrap(function))
     share_literal_versions(compiled)
     return compiled
 
@@ -177,7 +174,7 @@ def _mark(folder: Path, package: str) -> bool:
 
 # --- worker threads ---
 
-_SLICE_LENGTH = 1 << 15
+_SLICE_LENGTH = 1 << 15  # numbers of a slice: 128 KiB of float32, half of a core's cache
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 _calling_thread = threading.local()
 
@@ -239,7 +236,7 @@ def parallel_for_slices(work: Callable[[slice], object], length: int, report: Ca
 
     Args:
         work: as for `parallel_for`; numpy's loops run without the interpreter lock.
-        length: of the arrays.
+        length: the length of the arrays.
         report: called with the fraction done, by any thread; an exception ends the work.
     """
     count, done = -(-length // _SLICE_LENGTH), itertools.count(1)

@@ -37,8 +37,7 @@ from pansplat.system.files import expand_home, read_file
 
 LIMIT = 4 << 30  # bytes that the entries of a folder may take; the least recently used are removed
 _SUFFIX = ".entry"
-_FORMER_SUFFIXES = (".scene", ".npz")  # entries of earlier versions of pansplat, which are removed like others
-_IN_USE_SECONDS = 3600.0  # seconds: between two lines; of the longest whole time stated
+_IN_USE_SECONDS = 3600.0  # entries that another process used less than this time ago are not removed
 _ABANDONED_SECONDS = 3600.0  # an unfinished file that is older is that of a process that was killed
 _FORMAT = "1"  # version of the entries' format, which is part of their keys
 _TREE = "tree"  # name of an entry's metadata
@@ -63,7 +62,7 @@ class Store:
     """The entries of a folder: arrays, tensors, JSON, tuples and dataclasses of these.
 
     Args:
-        folder: of the panoramas; None keeps nothing.
+        folder: that of the panoramas; None keeps nothing.
         types: the dataclasses.
     """
 
@@ -190,7 +189,7 @@ def _prune(folder: Path) -> None:
             state = file.stat()
             if is_unfinished(file) and now - state.st_mtime > _ABANDONED_SECONDS:
                 file.unlink()
-            elif file.suffix in (_SUFFIX, *_FORMER_SUFFIXES):
+            elif file.suffix == _SUFFIX:
                 entries.append((state.st_mtime, state.st_size, file))
     total = sum(size for _, size, _ in entries)
     for used, size, file in sorted(entries):
@@ -230,7 +229,7 @@ def read_entry(path: Path, types: dict[str, type] | None = None) -> Any:
     """The value of an entry; an InputError if it is damaged.
 
     Args:
-        path: of the file.
+        path: the file.
         types: the dataclasses in it, by name.
     """
     content = read_file(path)

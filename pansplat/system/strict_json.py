@@ -101,7 +101,7 @@ def convert(value: Any, kind: Any, source: object, *, strict: bool = True) -> An
         strict: whether a text is no number.
     """
     try:
-        return msgspec.convert(value, kind, strict=strict)
+        return msgspec.convert(value, kind, strict=strict, dec_hook=lambda kind, content: kind(content))  # a Path
     except UnicodeEncodeError as error:
         raise InputError(f"{source}: needed valid Unicode, got {error.object!a:.{_QUOTED}}; correct it.") from error
     except msgspec.ValidationError as error:

@@ -14,7 +14,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 import torch
 from jaxtyping import Float
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 from torch import Tensor
 
 from pansplat.constants import MAX_FOV_DEGREES, MIN_FOV_DEGREES
@@ -34,26 +34,18 @@ from pansplat.tours.graph import TourGraph
 from pansplat.tours.route import find_angles
 
 MAX_SECONDS = 3600.0
-_FIELDS = ("seconds", "position", "direction", "vertical_fov_degrees")
-_DEFAULT_FOV = 75.0
 
-Vector = tuple[float, float, float]
+_Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Vector = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
-@dataclass(frozen=True)
-class KeyFrame:
-    """A camera at a time."""
+class KeyFrame(Struct, frozen=True, forbid_unknown_fields=True):
+    """A camera at a time, as in files."""
 
-    seconds: float  # since the start of the path
-    position: Vector  # in the world of a scene; of a file, in the user's world
+    seconds: Annotated[float, Meta(ge=0, le=MAX_SECONDS)]  # time since the start of the path
+    position: Vector  # place in the world of a scene; in a file, in the user's world
     direction: Vector  # where the camera looks
-    vertical_fov_degrees: float = _DEFAULT_FOV  # vertical field of view
-
-    @staticmethod
-    def of_pose(pose: Float[np.ndarray, "4 4"], seconds: float, vertical_fov_degrees: float) -> KeyFrame:
-        """The key frame of a camera."""
-        (px, py, pz), (dx, dy, dz) = pose[:3, 3].tolist(), pose[:3, 2].tolist()
-        return KeyFrame(seconds, (px, py, pz), (dx, dy, dz), vertical_fov_degrees)
+    vertical_fov_degrees: Annotated[float, Meta(ge=MIN_FOV_DEGREES, le=MAX_FOV_DEGREES)] = 75.0
 
 
 @dataclass(frozen=True)
@@ -115,8 +107,8 @@ class CameraPath:
 
     def map_places(self, move: Callable[[Tensor], Tensor]) -> CameraPath:
         """The path with other positions, as by `WorldFrame.localize_places` and back."""
-        places = (move(torch.tensor(frame.position, dtype=torch.float64)).tolist() for frame in self.key_frames)
-        moved = (replace(frame, position=(x, y, z)) for frame, (x, y, z) in zip(self.key_frames, places, strict=True))
+        places = (tuple(move(torch.tensor(frame.position, dtype=torch.float64)).tolist()) for frame in self.key_frames)
+        moved = (structs.replace(frame, position=place) for frame, place in zip(self.key_frames, places, strict=True))
         return CameraPath(tuple(moved))
 
     def remove(self, index: int) -> CameraPath:
@@ -130,28 +122,16 @@ def _find_angles(frame: KeyFrame, level: Float[np.ndarray, "3 3"]) -> tuple[floa
     return find_angles(np.round(direction, 12) + 0.0)
 
 
-_Coordinate = Annotated[float, Meta(ge=-1e9, le=1e9)]
-
-
-class _Entry(Struct, forbid_unknown_fields=True):
-    """A key frame of a file."""
-
-    seconds: Annotated[float, Meta(ge=0, le=MAX_SECONDS)]
-    position: tuple[_Coordinate, _Coordinate, _Coordinate]
-    direction: tuple[_Coordinate, _Coordinate, _Coordinate]
-    vertical_fov_degrees: Annotated[float, Meta(ge=MIN_FOV_DEGREES, le=MAX_FOV_DEGREES)] = _DEFAULT_FOV
-
-
 class _File(Struct, forbid_unknown_fields=True):
     """The content of a file."""
 
-    key_frames: list[_Entry] = []
+    key_frames: list[KeyFrame] = []
     software: str = ""
 
 
 def read_path(file: Path) -> CameraPath:
     """The path of a JSON file."""
-    frames = [KeyFrame(*(getattr(entry, key) for key in _FIELDS)) for entry in read_json(file, _File).key_frames]
+    frames = read_json(file, _File).key_frames
     if not frames:
         raise InputError(f'{file}: needed one or more "key_frames", got none; add them.')
     for number, frame in enumerate(frames):
@@ -168,7 +148,7 @@ def read_path(file: Path) -> CameraPath:
 
 def write_path(path: CameraPath, file: Path) -> None:
     """Write a path to a JSON file, which appears complete or not at all."""
-    rows = [{key: getattr(frame, key) for key in _FIELDS} for frame in path.key_frames]
-    text = "[\n  " + ",\n  ".join(json.dumps(row) for row in rows) + "\n]"
+    rows = (json.dumps(structs.asdict(frame)) for frame in path.key_frames)
+    text = "[\n  " + ",\n  ".join(rows) + "\n]"
     with replacing(file) as unfinished:
         unfinished.write_text(f'{{"software": "pansplat", "key_frames": {text}}}\n', "utf-8")

@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from shapely.geometry import Polygon
 
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import assign_storeys
@@ -21,21 +20,25 @@ class Rooms:
     """The rooms of a scene.
 
     Attributes:
-        level: right, down and forward (columns) of a level camera.
-        positions: of the cameras of all views.
         floors, ceilings: their distances below and above the camera of each view, metres.
-        outlines: views and outline, anticlockwise, of each room of the plan.
         houses: the views of each storey of a world, if at least half of its rooms are on the plan.
         plan: the floor plan.
     """
 
-    level: Float[np.ndarray, "3 3"]
-    positions: Float[np.ndarray, "view 3"]
     floors: Float[np.ndarray, "view"]
     ceilings: Float[np.ndarray, "view"]
-    outlines: tuple[tuple[tuple[int, ...], Polygon], ...]
     houses: tuple[tuple[int, ...], ...]
     plan: Plan
+
+    @property
+    def level(self) -> Float[np.ndarray, "3 3"]:
+        """Right, down and forward (columns) of a level camera."""
+        return self.plan.tour.level_axes
+
+    @cached_property
+    def eyes(self) -> Float[np.ndarray, "view 3"]:
+        """Right, down and forward of the cameras of all views."""
+        return self.plan.tour.positions @ self.level
 
     @cached_property
     def hosts(self) -> tuple[int, ...]:
@@ -49,7 +52,7 @@ class Rooms:
         """Where places of a house (right, down, forward) are shown: beside its host, on the same floor."""
         if (host := self.hosts[house]) == house:
             return places
-        floors = self.positions @ self.level[:, 1] + self.floors
+        floors = self.eyes[:, 1] + self.floors
         own, other = (float(np.median(floors[list(self.houses[number])])) for number in (house, host))
         flat = self.plan.drawn[self.houses[house][0]].move(places[..., (0, 2)])
         return np.stack((flat[..., 0], places[..., 1] + other - own, flat[..., 1]), axis=-1)
@@ -58,7 +61,6 @@ class Rooms:
 def find_rooms(facts: TourFacts) -> Rooms:
     """The rooms of a scene of all panoramas: those of the floor plan."""
     tour, plan = facts.tour, facts.plan
-    outlines = [(room.panoramas, Polygon(room.outline)) for room in plan.rooms]  # anticlockwise
     keys = list(zip(tour.worlds, assign_storeys(tour), strict=True))
     enclosed = {view for room in plan.rooms if room.is_closed for view in room.panoramas}
     houses = []
@@ -68,11 +70,8 @@ def find_rooms(facts: TourFacts) -> Rooms:
         if sum(room.is_closed and room.panoramas[0] in views for room in plan.rooms) >= max(missing, 1):
             houses.append(views)
     return Rooms(
-        tour.level_axes,
-        tour.positions,
         np.array(facts.usual_heights),
         np.array([ceiling or _USUAL_CEILING * plan.camera_height for ceiling in facts.ceilings]),
-        tuple(outlines),
         tuple(houses),
         plan,
     )

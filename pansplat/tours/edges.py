@@ -27,14 +27,13 @@ _COSINE = math.cos(math.radians(3))  # least cosine of Gaussians around the dire
 _SHARE = 0.98  # share of those Gaussians that a wall has in front of the other camera; others stray
 _DEPTH = 0.95  # largest depth of a wall, relative to the distance of the other camera
 
-_Points = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]  # places and colours
-
 
 def find_walls(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     """The edges that lead through a wall or a closed door: each camera sees a surface in front of the other camera.
 
     Args:
-        surfaces, edges: see `judge_edges`.
+        surfaces: that some panoramas show.
+        edges: pairs of panoramas; those with another panorama are left out.
     """
 
     def is_blocked(node: int, other: int) -> bool:
@@ -47,22 +46,12 @@ def find_walls(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]
 
 
 def find_poor_edges(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """The edges of `judge_edges` whose flights would be poor."""
-    return tuple(edge for edge, error in judge_edges(surfaces, edges).items() if error > POOR)
-
-
-def judge_edges(surfaces: Mapping[int, Surfaces], edges: Iterable[tuple[int, int]]) -> dict[tuple[int, int], float]:
-    """The share of the pictures of a flight that shows things twice, of each edge in its worse direction.
+    """The edges whose flights would show too much twice (`measure_doubled`).
 
     Args:
-        surfaces: that some panoramas show.
-        edges: pairs of panoramas; those with another panorama are left out.
+        surfaces, edges: see `find_walls`.
     """
-    inside = _list_inside(surfaces, edges)
-    points = {
-        node: (surfaces[node].opaque, surfaces[node].colors) for node in {node for edge in inside for node in edge}
-    }
-    return {(a, b): measure_doubled(points[a], points[b], surfaces[b].center - surfaces[a].center) for a, b in inside}
+    return tuple((a, b) for a, b in _list_inside(surfaces, edges) if measure_doubled(surfaces[a], surfaces[b]) > POOR)
 
 
 def _list_inside(nodes: Container[int], edges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -70,15 +59,12 @@ def _list_inside(nodes: Container[int], edges: Iterable[tuple[int, int]]) -> lis
     return [(a, b) for a, b in edges if a != b and a in nodes and b in nodes]
 
 
-def measure_doubled(first: _Points, second: _Points, way: Float[np.ndarray, "3"]) -> float:
-    """The share of what two panoramas show twice on a way between them, ahead or back, whichever is more.
+def measure_doubled(first: Surfaces, second: Surfaces) -> float:
+    """The share of the pictures of a flight between two panoramas that shows things twice, in the worse direction.
 
     It is 1 where they show nothing in common.
-
-    Args:
-        first, second: places of surfaces relative to their cameras, and their colours in [0, 1].
-        way: from the first camera to the second one.
     """
+    way = second.center - first.center
     rays, area = pixel_directions(_ROWS, 2 * _ROWS).numpy(), row_weights(_ROWS).numpy()[:, None]
     cosines = rays @ (way / np.linalg.norm(way))
     shares = np.ones((2, len(_PLACES)))
@@ -96,10 +82,11 @@ def measure_doubled(first: _Points, second: _Points, way: Float[np.ndarray, "3"]
 
 
 def _draw(
-    points: _Points, camera: Float[np.ndarray, "3"]
+    surfaces: Surfaces, camera: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
-    """Radial depth around a camera of the nearest point in each pixel, infinite without one, and its colour."""
-    places, colors = points[0] - camera, points[1]
+    """Radial depth around a place (relative to the camera) of the nearest point in each pixel, infinite without one,
+    and its colour."""
+    places, colors = surfaces.opaque - camera, surfaces.colors
     distances = np.maximum(np.linalg.norm(places, axis=1), 1e-9)
     rows = np.arccos(np.clip(-places[:, 1] / distances, -1, 1)) / np.pi * _ROWS
     columns = (np.arctan2(places[:, 0], places[:, 2]) / (2 * np.pi) + 0.5) * 2 * _ROWS

@@ -18,7 +18,8 @@ from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 from pansplat.tours.edges import find_poor_edges, find_walls
 from pansplat.tours.floor import FloorOutline, choose_camera_height, find_ceiling, find_floor, find_floor_outline
-from pansplat.tours.graph import Edge, TourGraph, ViewNumbers, make_graph
+from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
+from pansplat.tours.merge import describe_tour, make_graph
 from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
 from pansplat.tours.plan import Door, Plan, Room, make_plan
 from pansplat.tours.surfaces import Surfaces, find_surfaces
@@ -82,7 +83,7 @@ class TourFacts:
     def _key(self) -> str:
         """A hash of all that a part depends on."""
         tour, gaussians = self.tour, self.scene.gaussians
-        edges = [row for row in tour.list_overlaps() if {*row[:2]} <= {*self.views}]
+        edges = [row for row in describe_tour(tour).overlaps if {*row[:2]} <= {*self.views}]
         names = [(panorama.name, panorama.title) for panorama in tour.panoramas]
         arrays = gaussians.means, gaussians.opacities, gaussians.views, gaussians.levels, self.scene.cam2world
         return hash_parts(
@@ -149,7 +150,7 @@ class TourFacts:
     @_stored
     def walls(self) -> list[Edge]:
         """The edges that the scene shows to be none (`find_walls`); a scene of `merge_scenes` has no others."""
-        return [] if self.scene.overlaps else find_walls(self.surfaces, self.tour.overlaps)
+        return [] if self.scene.tour else find_walls(self.surfaces, self.tour.overlaps)
 
     @_stored
     def poor(self) -> tuple[Edge, ...]:
@@ -163,5 +164,5 @@ class TourFacts:
 
     @_stored
     def _plan(self) -> dict[str, Any]:
-        plan = make_plan([*self.surfaces.values()], self.tour, self.heights)
+        plan = make_plan([*self.surfaces.values()], self.tour, self.heights, self.ceilings, self._floors)
         return {name: value for name, value in vars(plan).items() if name != "tour"}

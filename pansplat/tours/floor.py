@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -14,11 +15,11 @@ from shapely.geometry import Polygon
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import Surfaces, split_by_azimuth
 
-_CAMERA_HEIGHT = 0.15  # of a camera over an unknown floor, as a fraction of far
-_AZIMUTHS = 180  # of a floor outline
-_NECK = 0.3  # half of the width of a door, of the camera's height; narrower floors are none
-_LEAST_FULL = 0.65  # of the convex hull of a floor; rays through several wide openings have 0.5 to 0.64
-_STOREY_GAP, _STOREY_REACH = 1.2, 0.4  # metres: least distance of the cameras of two storeys; from a storey's level
+_CAMERA_HEIGHT = 0.15  # height of a camera over a floor that is not seen, as a fraction of far
+_AZIMUTHS = 180  # number of corners of a floor outline
+_NECK = 0.3  # half the width of a door, in heights of the camera; floors end where they are narrower
+_LEAST_FULL = 0.65  # least part of its convex hull that a floor fills; rays through wide openings fill 0.5 to 0.64
+_STOREY_GAP, _STOREY_REACH = 1.2, 0.4  # least distance of storeys, and largest one of a camera from its own, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +27,10 @@ class FloorOutline:
     """Where the floor that one panorama shows ends, seen from above.
 
     Attributes:
-        center: of the camera, in the plan's coordinates: metres to the right and forward of the tour's level axes.
-        corners: end of the floor at equal steps of azimuth.
+        corners: end of the floor at equal steps of azimuth, metres to the right and forward of the tour's level axes.
         camera_height: of the camera over the floor, metres.
     """
 
-    center: Float[np.ndarray, "2"]
     corners: Float[np.ndarray, "azimuth 2"]
     camera_height: float
 
@@ -80,11 +79,7 @@ def find_floor_outline(surfaces: Surfaces) -> FloorOutline | None:
     stand on it, if these are nearer.
     """
     found = trace_floor(surfaces.samples)
-    if found is None:
-        return None
-    corners, height = found
-    center = surfaces.center[[0, 2]]
-    return FloorOutline(center, center + corners, height)
+    return None if found is None else FloorOutline(surfaces.center[[0, 2]] + found[0], found[1])
 
 
 def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "azimuth 2"], float] | None:
@@ -157,30 +152,23 @@ def find_storeys(heights: Float[np.ndarray, "n"]) -> list[list[int]]:
 
 
 def find_other_storeys(tour: TourGraph, position: Float[np.ndarray, "3"]) -> frozenset[int]:
-    """The panoramas of the world around a position that are in another storey, each in the one of the nearest level."""
+    """The panoramas of the world around a position in other storeys than the one that is nearest in height."""
     nearest = int(np.linalg.norm(tour.positions - position, axis=1).argmin())
-    members, levels = _find_levels(tour, tour.worlds[nearest])
-    places = np.concatenate((tour.positions[members], position[None])) @ -tour.level_axes[:, 1]
-    storeys = np.abs(places[:, None] - levels).argmin(axis=1)
-    return frozenset(np.array(members)[storeys[:-1] != storeys[-1]].tolist())
+    members = np.flatnonzero(np.array(tour.worlds) == tour.worlds[nearest])
+    storeys = np.array(assign_storeys(tour))[members]
+    rises = (tour.positions[members] - position) @ tour.level_axes[:, 1]
+    return frozenset(members[storeys != storeys[np.abs(rises).argmin()]].tolist())
 
 
+@lru_cache(maxsize=8)
 def assign_storeys(tour: TourGraph) -> list[int]:
     """The storey of each panorama in its world, that of the nearest level; 0 is the lowest.
 
     Heights of two worlds cannot be compared: a panorama that is not placed is in storey 0 of its own.
     """
-    storeys = [0] * len(tour)
+    worlds, heights, storeys = np.array(tour.worlds), tour.positions @ -tour.level_axes[:, 1], np.zeros(len(tour), int)
     for world in set(tour.worlds):
-        members, levels = _find_levels(tour, world)
-        heights = tour.positions[members] @ -tour.level_axes[:, 1]
-        for node, storey in zip(members, np.abs(heights[:, None] - levels).argmin(axis=1).tolist(), strict=True):
-            storeys[node] = storey
-    return storeys
-
-
-def _find_levels(tour: TourGraph, world: int) -> tuple[list[int], Float[np.ndarray, "storey"]]:
-    """The panoramas of a world, and the levels of its storeys, the lowest first."""
-    members = [node for node, own in enumerate(tour.worlds) if own == world]
-    heights = tour.positions[members] @ -tour.level_axes[:, 1]
-    return members, np.sort([float(np.median(heights[storey])) for storey in find_storeys(heights)])
+        own = heights[worlds == world]
+        levels = np.sort([np.median(own[storey]) for storey in find_storeys(own)])
+        storeys[worlds == world] = np.abs(own[:, None] - levels).argmin(axis=1)
+    return storeys.tolist()

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from pansplat.geometry.path import level_pose, up_direction
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 
-REACH = 2.0  # metres, in which a camera moves around the panoramas of its part
-_GAP = 8.0  # metres, between what the cameras of two worlds reach, so that few rooms meet in the floor plan
-_ASPECT = 1.5  # of the width of all rows to the square root of their area
+REACH = 2.0  # metres in which a camera moves around the panoramas of its part
+_GAP = 8.0  # metres between what the cameras of two worlds reach, so that few rooms meet in the floor plan
+_ASPECT = 1.5  # width of all rows, relative to the square root of their area
 
 
 def lay_out(panoramas: Sequence[Panorama]) -> tuple[Panorama, ...]:

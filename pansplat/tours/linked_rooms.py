@@ -15,19 +15,37 @@ from shapely.geometry import Point, Polygon
 
 from pansplat.geometry.path import wrap_angle
 from pansplat.tours.floor import assign_storeys
-from pansplat.tours.graph import DrawnPlace, TourGraph, turn_plan
-from pansplat.tours.surfaces import Outline, meet_outline, ray_directions
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.surfaces import RAY_DIRECTIONS, Outline, meet_outline
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
-_ASIDE, _LINK_ERROR = range(-180, 180, 6), 12.0  # degrees: of a door from its link, and the usual one
-_THICKNESS, _STEP = 0.08, 0.45  # of a wall between two rooms; from a wall to the dot of a room behind it
-_MOST_OVERLAP, _PUSH = 0.01, 0.1  # share of a room in others; step away from them
-_APART, _FARTHEST = 9.0, 200.0  # cost of a unit away, and at most
-_PLACE_ERROR, _TURN_ERROR = 0.5, 0.25  # of a stated place, and its turn, radians
-_FAN = math.radians(50)  # between dots that are behind one dot
+_ASIDE, _LINK_ERROR = range(-180, 180, 6), 12.0  # tried and usual angles between a door and its link, degrees
+_THICKNESS, _STEP = 0.08, 0.45  # thickness of a wall between two rooms; distance of a dot from the wall before it
+_MOST_OVERLAP, _PUSH = 0.01, 0.1  # largest share of a room that is in others; length of a step away from them
+_APART, _FARTHEST = 9.0, 200.0  # cost of a unit away from the door; least cost of a place that is not used
+_PLACE_ERROR, _TURN_ERROR = 0.5, 0.25  # usual errors of a stated place, and of its turn, radians
+_FAN = math.radians(50)  # angle between dots that are behind one dot
 
 
 Vector, Way = Float[np.ndarray, "2"], tuple[int, int]
+
+
+class DrawnPlace(NamedTuple):
+    """Where a plan shows a panorama at an approximate place.
+
+    Attributes:
+        beside: the panorama whose world it is shown in.
+        turn: of what is around it, radians to the right; None if it is unknown.
+        shift: after the turn, to the right and forward of the tour's level axes, metres.
+    """
+
+    beside: int
+    turn: float | None
+    shift: Float[np.ndarray, "2"]
+
+    def move(self, places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where places around the panorama are shown, to the right and forward."""
+        return places @ turn_plan(self.turn or 0.0) + self.shift
 
 
 class _Shown(NamedTuple):
@@ -66,8 +84,8 @@ def place_rooms(tour: TourGraph, outlines: Mapping[int, Outline], unit: float) -
             first = drawn[a].beside if a in drawn else a
             around = [n for n in piece if storeys[drawn[n].beside if n in drawn else n] == storeys[first]]
             taken = shapely.union_all([Polygon(shown[n].outline) for n in around if shown[n].turn is not None])
-            stated = tour.approximate.get(b)
-            stated = stated if stated is not None and worlds[stated.beside] == root else None
+            is_stated = b in tour.approximate and worlds[tour.approximate[b][0]] == root
+            stated = find_stated_place(tour, b) if is_stated else None
             moved = _find_motion(tour, (a, b), (shown[a], own[b]), taken, unit, stated)
             if moved is None:
                 dots = shapely.MultiPoint([shown[n].place for n in around]).buffer(_STEP * unit)
@@ -80,23 +98,38 @@ def place_rooms(tour: TourGraph, outlines: Mapping[int, Outline], unit: float) -
     return drawn
 
 
+def turn_plan(yaw: float) -> Float[np.ndarray, "2 2"]:
+    """The rotation to the right of rows (right, forward), which is applied from the right."""
+    return np.array(((math.cos(yaw), -math.sin(yaw)), (math.sin(yaw), math.cos(yaw))))
+
+
+def find_stated_place(tour: TourGraph, node: int) -> DrawnPlace:
+    """Where the plan shows a panorama at an approximate place (`TourGraph.approximate`), by that alone."""
+    beside, about = tour.approximate[node]
+    yaw, own = (math.atan2(*(tour.level_axes.T @ tour.cam2world[n, :3, 2].numpy())[::2]) for n in (beside, node))
+    view, centers = tour.panoramas[beside], tour.positions @ tour.level_axes[:, (0, 2)]
+    scale = view.camera_height if about.is_in_heights else 1 / view.frame.unit
+    offset, turn = scale * np.array((about.right, about.forward)), wrap_angle(yaw + about.yaw - own)
+    return DrawnPlace(beside, turn, centers[beside] + offset @ turn_plan(yaw) - centers[node] @ turn_plan(turn))
+
+
 def _list_ways(tour: TourGraph, shown: Mapping[int, _Shown], piece: set[int]) -> list[Way]:
     """The links to panoramas that are not shown yet; those with a link back first, from rooms with an outline."""
-    stated = [(place.beside, node) for node, place in tour.approximate.items()]
+    stated = [(beside, node) for node, (beside, _) in tour.approximate.items()]
     ways = [(a, b) for a, b in (*tour.links, *stated) if a in piece and b not in shown]
     return sorted(ways, key=lambda way: ((shown[way[0]].turn is None) + (way[::-1] not in tour.links), way))
 
 
 def _measure_azimuth(tour: TourGraph, way: Way) -> float:
     """The direction of a link, radians from forward to the right; 0 if it is vertical."""
-    right, _, forward = tour.level_axes.T @ tour.find_direction(*way)
+    right, _, forward = tour.find_direction(*way)
     return math.atan2(right, forward)
 
 
 def _find_doors(room: _Shown, azimuth: float) -> list[tuple[Vector, Vector, float]]:
     """Where directions around that of a link meet the walls of a room: place, normal outwards, error."""
     reach, walls = meet_outline(room.place, room.outline)
-    rays, sides, found = ray_directions(), np.roll(room.outline, -1, axis=0) - room.outline, []
+    rays, sides, found = RAY_DIRECTIONS, np.roll(room.outline, -1, axis=0) - room.outline, []
     for aside in _ASIDE:
         ray = math.floor(math.degrees(azimuth) + aside) % len(rays)
         if walls[ray] >= 0:

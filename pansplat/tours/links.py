@@ -8,15 +8,15 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.panorama_sets import Link
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.outlook import find_bin
+from pansplat.tours.outlook import find_bins
 
-RING_RADIUS = 0.22  # metres, on the floor
-RING_DISTANCE = 0.66  # metres from the camera, within which a panorama has no ring
-_NEAREST_METRES = 1.0  # of a link's ring
+RING_RADIUS = 0.22  # radius of a ring on the floor, metres
+RING_DISTANCE = 0.66  # distance of a panorama, metres, within which it has no ring
+_NEAREST_METRES = 1.0  # least distance of a link's ring
 _WALL_METRES = 3.0  # usual distance of a wall
-_MIN_LEVEL = 0.1  # level length of the direction of a link that is not vertical
+_MIN_LEVEL = 0.1  # level part of the unit direction of a link, below which it is vertical
 
 
 def link_parts(tour: TourGraph) -> TourGraph:
@@ -46,16 +46,12 @@ def find_link_ring(
         height: of the camera over the floor, metres.
         outlook: of `measure_outlook` at the first node, in the level axes of the tour; zeros and None are unknown.
     """
-    direction, down = tour.find_direction(start, end), tour.level_axes[:, 1]
-    if direction is None:
+    direction = tour.find_direction(start, end)
+    if direction is None or (length := math.hypot(*direction[[0, 2]])) < _MIN_LEVEL:
         return None
-    flat = direction - (direction @ down) * down
-    length = float(np.linalg.norm(flat))
-    if length < _MIN_LEVEL:
-        return None
-    along, slope = flat / length, float(direction @ down) / length
-    right, _, forward = tour.level_axes.T @ along
-    wall = _WALL_METRES if outlook is None else float(outlook[find_bin(math.atan2(right, forward))]) or _WALL_METRES
+    right, slope, forward = direction / length
+    wall = _WALL_METRES if outlook is None else float(outlook[find_bins(np.arctan2(right, forward))]) or _WALL_METRES
     if slope * wall < height:
-        return wall * (along + slope * down)
-    return max(height / slope, _NEAREST_METRES) * along + height * down
+        return tour.level_axes @ (wall * right, wall * slope, wall * forward)
+    distance = max(height / slope, _NEAREST_METRES)
+    return tour.level_axes @ (distance * right, height, distance * forward)

@@ -20,12 +20,12 @@ from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 from pansplat.tours.graph import Edge, TourGraph
 
-_HEIGHT = 48
-_CANDIDATES = 24
-_MIN_OVERLAP = 0.12
-_MIN_GIVEN_OVERLAP = 0.03  # of an edge that is given; flights of furnished homes with a free way have .1 or more
-_MAX_BASELINE = 0.4  # of an edge that is not given, as a fraction of far
-_MAX_NEIGHBOURS = 6  # nearest panoramas that are compared
+_HEIGHT = 48  # rows of the images that are compared
+_CANDIDATES = 24  # number of depths that a pixel is compared at
+_MIN_OVERLAP = 0.12  # least overlap of an edge that is not given
+_MIN_GIVEN_OVERLAP = 0.03  # least overlap of one that is; flights of furnished homes with a free way have 0.1 or more
+_MAX_BASELINE = 0.4  # largest length of an edge that is not given, as a fraction of far
+_MAX_NEIGHBOURS = 6  # number of the nearest panoramas that each is compared with
 
 
 @stage()
@@ -56,8 +56,6 @@ def connect(tour: TourGraph) -> TourGraph:
             overlaps[edge] = overlap
         elif edge in tour.overlaps:
             walls.append(edge)
-    joined = {node for edge in (*overlaps, *walls) for node in edge}
-    overlaps |= {(a, b): overlap for (a, b), overlap in tour.overlaps.items() if a == b and a not in joined}
     return dataclasses.replace(tour, overlaps=overlaps).with_walls(walls)
 
 

@@ -19,48 +19,44 @@ from functools import cached_property
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import Polygon
 
-from pansplat.geometry.world import WorldFrame
 from pansplat.system.components import label_components
-from pansplat.tours.floor import assign_storeys, choose_camera_height, find_ceiling, find_floor_outline, trace_floor
-from pansplat.tours.graph import DrawnPlace, TourGraph
-from pansplat.tours.linked_rooms import place_rooms
-from pansplat.tours.surfaces import (
-    RAYS,
-    Outline,
-    Surfaces,
-    meet_outline,
-    ray_angles,
-    ray_directions,
-    split_by_azimuth,
-)
+from pansplat.tours.floor import FloorOutline, assign_storeys, choose_camera_height
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
+from pansplat.tours.surfaces import RAY_ANGLES, RAY_DIRECTIONS, RAYS, Outline, Surfaces, meet_outline, split_by_azimuth
 
-_SHAPE_ERROR = 0.2  # of an area; 13 of 19 rooms of generated homes with two panoramas are within it
-_WALL_BAND = 0.6, 0.85  # of a wall above doors and below beams, fractions of the ceiling's height over the camera
-_LEAST_CEILING = 0.25  # height over the camera, below which doors may reach into the band
-_SURFACE = 0.12  # largest difference from the distance of a surface, as a fraction
-_BESIDE = 1  # rays whose places count, too
-_LEAST_DISTANCE = 0.25  # of a wall; a lamp may be above a camera
-_SPAN = 2  # rays on either side of the chord that states a wall's direction
-_LARGEST_STEP = 0.3  # length of such a chord, as a fraction of its distance
-_PARALLEL = math.radians(15)  # of a chord and its wall
+# What a panorama shows of walls.
+_WALL_BAND = 0.6, 0.85  # walls are sought between these fractions of the ceiling's height over the camera
+_LEAST_CEILING = 0.25  # least height of a ceiling over the camera; doors may reach into the band of a lower one
+_SURFACE = 0.12  # largest difference of the places of one surface, as a fraction of their distance
+_BESIDE = 1  # number of rays on either side of one whose places count for it, too
+_LEAST_DISTANCE = 0.25  # least distance of a wall from the camera; nearer places may be a lamp above it
+_LOW = 0.5, 0.9  # openings reach to the floor if they are seen between these fractions of the height below the camera
+# Directions and lines of walls. Chords connect places of walls; their lengths are the weights.
+_SPAN = 2  # number of rays on either side of the one whose chord states a wall's direction
+_LARGEST_STEP = 0.3  # largest length of a chord, as a fraction of its distance
+_PARALLEL = math.radians(15)  # largest angle between a chord and its wall
 _SKEW = math.radians(3)  # largest angle between a side of an outline and its wall
-_OBLIQUE, _OBLIQUE_SHARE = math.radians(12), 0.15  # least angle to the main directions, and share of all chords
-_CLUSTER, _LEAST_WALL, _MOST_LINES = 0.07, 0.2, 24  # half width of a line's chords, its length, lines of a direction
-_DISTANCE_NOISE, _LARGEST_ERROR = 0.07, 0.35  # of the distance of a wall
-_CORNER, _JUMP, _LARGEST_JUMP = 5.0, 0.15, 5.0  # costs of another wall, in errors of one ray; of a jump in depth
+_OBLIQUE, _OBLIQUE_SHARE = math.radians(12), 0.15  # oblique walls: least angle to others, and share of all chords
+_CLUSTER, _LEAST_WALL, _MOST_LINES = 0.07, 0.2, 24  # a line: half its width, its least length; lines of a direction
+# The outline of a room. Costs are in errors of one ray.
+_DISTANCE_NOISE, _LARGEST_ERROR = 0.07, 0.35  # usual and largest error of the distance of a wall
+_CORNER, _JUMP, _LARGEST_JUMP = 5.0, 0.15, 5.0  # cost of another wall; a jump in depth that costs 1, and its most
 _NEVER = 1e4  # cost of a wall in a direction in which it is not
-_NARROW, _COLLINEAR = 0.12, 0.02  # half width of spikes that are left out; merged pieces of walls
-_LEAST_AREA = 0.4  # of a room, squared camera heights
-_BEYOND = 0.25  # of the floor behind an opening
-_LOW = 0.5, 0.9  # where an opening that reaches to the floor is seen, fractions of the height below the camera
-_BROAD, _LEAST_HALF = (0.12, 0.88), 0.5  # of the ends of a floor, which goes on behind doors; half a rectangle's side
-_LEAST_PIECE = 0.1  # of a rectangle without other rooms, squared camera heights
-_EYE_BAND = 0.4  # heights of the surfaces around a rectangle, over and under the camera
-_DOOR_WIDTHS = 0.33, 1.7
-_SAME_DOOR = 0.4  # distance of the middles of an opening from two sides
-_NEAR_WALL, _LEAST_SEEN = 0.2, 8  # places that show a wall; number of them by one panorama
+_NARROW, _COLLINEAR = 0.12, 0.02  # half the width of spikes that are left out; pieces of one wall differ by less
+_LEAST_AREA = 0.4  # least area of a room, squared camera heights
+_SHAPE_ERROR = 0.2  # error of an area by its shape, as a fraction; 13 of 19 generated rooms of two panoramas have less
+# Rectangles around cameras whose walls are open.
+_BROAD = 0.12, 0.88  # quantiles of the ends of a floor, which goes on behind doors
+_LEAST_HALF, _LEAST_PIECE = 0.5, 0.1  # least half side, and least area, squared camera heights, without other rooms
+_EYE_BAND = 0.4  # surfaces around a camera without a floor are at most so far over or under it
+# Doors, and the accuracy of walls.
+_BEYOND = 0.25  # least length of the floor that is seen behind an opening
+_DOOR_WIDTHS = 0.33, 1.7  # least and largest width of an opening
+_SAME_DOOR = 0.4  # largest distance of the middles of an opening as seen from two sides
+_NEAR_WALL, _LEAST_SEEN = 0.2, 8  # largest distance of places from their wall; least number of them by one panorama
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +79,10 @@ class Room:
     is_placed: bool
     is_closed: bool = True
 
-    @property
-    def area(self) -> float:
-        """The area of the room, square metres."""
-        return float(Polygon(self.outline).area)
+    @cached_property
+    def shape(self) -> Polygon:
+        """The outline as a shape."""
+        return Polygon(self.outline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,11 +121,6 @@ class Plan:
     num_heights: int
     num_walls: int
 
-    @property
-    def frame(self) -> WorldFrame:
-        """Where the world of the plan is in that of files."""
-        return self.tour.panoramas[0].frame
-
     @cached_property
     def drawn(self) -> dict[int, DrawnPlace]:
         """Where panoramas are that links join with others (`place_rooms`)."""
@@ -156,7 +147,8 @@ class Plan:
         """Standard deviation of a room's area, square metres, by those of the scale, of its walls and of its shape."""
         edges = np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1)
         walls = (self.wall_error or 0.0) * float(np.linalg.norm(edges))
-        return math.hypot(walls, 2 * (self.scale_error or 0.0) * room.area, _SHAPE_ERROR * room.area)
+        area = room.shape.area
+        return math.hypot(walls, 2 * (self.scale_error or 0.0) * area, _SHAPE_ERROR * area)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,17 +176,25 @@ class _Lines:
     offsets: Float[np.ndarray, "line"]
 
 
-def make_plan(surfaces: Sequence[Surfaces], tour: TourGraph, heights: Sequence[float | None]) -> Plan:
+def make_plan(
+    surfaces: Sequence[Surfaces],
+    tour: TourGraph,
+    heights: Sequence[float | None],
+    ceilings: Sequence[float | None],
+    floors: Sequence[FloorOutline | None],
+) -> Plan:
     """The floor plan of a tour.
 
     Args:
         surfaces: that each panorama shows.
         tour: the graph.
-        heights: of the cameras over the floor (`find_floor`).
+        heights, ceilings: distances of floors and ceilings below and above the cameras (`find_floor`, `find_ceiling`).
+        floors: their outlines (`find_floor_outline`).
     """
     known = np.array([height for height in heights if height is not None])
     count, unit = len(tour), choose_camera_height(heights, tour.far)
-    sights = [_look(own, height or unit) for own, height in zip(surfaces, heights, strict=True)]
+    seen = zip(surfaces, heights, ceilings, floors, strict=True)
+    sights = [_look(own, height or unit, ceiling, floor) for own, height, ceiling, floor in seen]
     storeys, parts = assign_storeys(tour), tour.worlds
     rooms: list[Room] = []
     for part, storey in sorted({*zip(parts, storeys, strict=True)}):
@@ -210,7 +210,7 @@ def make_plan(surfaces: Sequence[Surfaces], tour: TourGraph, heights: Sequence[f
             if inside:
                 nodes, *others = found[inside[0]]
                 found[inside[0]] = ((*nodes, view), *others)
-            elif (outline := _enclose(surfaces[view], normals, beside, unit)) is not None:
+            elif (outline := _enclose(surfaces[view], floors[view], normals, beside, unit)) is not None:
                 found.append(((view,), outline, False))
         for nodes, outline, is_closed in found:
             is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
@@ -221,12 +221,14 @@ def make_plan(surfaces: Sequence[Surfaces], tour: TourGraph, heights: Sequence[f
     return Plan(tour, tuple(rooms), doors, unit, scale, disagreement, len(known), num_walls)
 
 
-def _enclose(surfaces: Surfaces, normals: np.ndarray, beside: shapely.Geometry, unit: float) -> Outline | None:
+def _enclose(
+    surfaces: Surfaces, floor: FloorOutline | None, normals: np.ndarray, beside: shapely.Geometry, unit: float
+) -> Outline | None:
     """A rectangle along the walls around a camera without closed walls: the extent of its floor, or of the surfaces at
     its height, without the rooms beside it; None if nothing of it is left.
     """
-    center, places, floor = surfaces.center[[0, 2]], surfaces.samples, find_floor_outline(surfaces)
-    ends = _measure_reach(places[np.abs(places[:, 1]) < _EYE_BAND * unit][:, (0, 2)])[:, None] * ray_directions()
+    center, places = surfaces.center[[0, 2]], surfaces.samples
+    ends = _measure_reach(places[np.abs(places[:, 1]) < _EYE_BAND * unit][:, (0, 2)])[:, None] * RAY_DIRECTIONS
     corners = center + ends[np.isfinite(ends[:, 0])] if floor is None else floor.corners
     axes, least = np.stack((normals[0], (-normals[0, 1], normals[0, 0])), axis=1), _LEAST_HALF * unit
     low, high = np.quantile(corners @ axes, _BROAD, axis=0) if len(corners) else (center @ axes,) * 2
@@ -243,25 +245,23 @@ def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
     return " / ".join(names) if len(names) < 3 else f"{names[0]} + {len(names) - 1}"
 
 
-def _look(surfaces: Surfaces, height: float) -> _Sight | None:
+def _look(surfaces: Surfaces, height: float, ceiling: float | None, floor: FloorOutline | None) -> _Sight | None:
     """What a panorama shows; None if it shows no walls."""
     center, places = surfaces.center[[0, 2]], surfaces.samples
     down, flat = places[:, 1], places[:, (0, 2)]
     low = flat[(down > _LOW[0] * height) & (down < _LOW[1] * height)]
-    ceiling = find_ceiling(places)
     if ceiling is None or ceiling < _LEAST_CEILING * height:
-        found = trace_floor(places)
-        if found is None:
+        if floor is None:
             return None
-        reach = np.repeat(np.linalg.norm(found[0], axis=1), RAYS // len(found[0]))
-        walls = reach[:, None] * ray_directions()
+        reach = np.repeat(np.linalg.norm(floor.corners - center, axis=1), RAYS // len(floor.corners))
+        walls = reach[:, None] * RAY_DIRECTIONS
         return _Sight(center, walls, center + walls, low[:0])  # no wall is above the openings
     band = flat[(-down > _WALL_BAND[0] * ceiling) & (-down < _WALL_BAND[1] * ceiling)]
     band = band[np.linalg.norm(band, axis=1) > _LEAST_DISTANCE * height]
     reach = _measure_reach(band)
     if np.isfinite(reach).sum() < RAYS // 2:
         return None
-    return _Sight(center, reach[:, None] * ray_directions(), center + band, low)
+    return _Sight(center, reach[:, None] * RAY_DIRECTIONS, center + band, low)
 
 
 def _measure_reach(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "ray"]:
@@ -403,7 +403,7 @@ def _choose_lines(sight: _Sight, lines: _Lines, unit: float) -> np.ndarray | Non
             distance = offsets / (rays @ lines.normals.T)
         return np.where(distance > 0, distance, np.inf)
 
-    reached = meet(ray_directions())
+    reached = meet(RAY_DIRECTIONS)
     error = np.abs(reached - measured[:, None]) / unit
     costs = np.minimum(np.where(np.isnan(error), 0, error), _LARGEST_ERROR) / _DISTANCE_NOISE
     costs[np.isinf(reached)] = _NEVER
@@ -505,15 +505,8 @@ def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
     narrow = _NARROW * unit
     for sign in (-1, 1):  # first spikes, then slots
         shape = shape.buffer(sign * narrow, join_style="mitre").buffer(-sign * narrow, join_style="mitre")
-    # The start of a ring may be in the middle of a wall, where `simplify` keeps it.
-    rings = []
-    for piece in shapely.get_parts(shape):
-        if piece.is_empty:
-            continue
-        corners = np.array(piece.exterior.simplify(_COLLINEAR * unit).coords)[:-1]
-        turned = np.roll(corners, -1, axis=0)
-        rings.append(Polygon(np.array(Polygon(turned).exterior.simplify(_COLLINEAR * unit).coords)))
-    return MultiPolygon(rings) if len(rings) != 1 else rings[0]
+    pieces = [piece for piece in shapely.get_parts(shape) if not piece.is_empty]
+    return shapely.union_all([Polygon(piece.exterior).simplify(_COLLINEAR * unit) for piece in pieces])
 
 
 def _separate(
@@ -601,7 +594,7 @@ def _find_openings(sight: _Sight, outline: Outline, unit: float) -> list[tuple[n
             continue
         half = math.pi / RAYS
         corners = outline[label], outline[(label + 1) % len(outline)]
-        angles = ray_angles()[[rays[0], rays[-1]]] + (-half, half)
+        angles = RAY_ANGLES[[rays[0], rays[-1]]] + (-half, half)
         ends = np.array([_meet_line(sight.center, angle, *corners) for angle in angles])
         width = float(np.linalg.norm(ends[1] - ends[0]))
         if _DOOR_WIDTHS[0] * unit < width < _DOOR_WIDTHS[1] * unit:

@@ -17,18 +17,18 @@ from jaxtyping import Float
 
 from pansplat.geometry.path import turn_axes, wrap_angle
 from pansplat.tours.graph import Edge, TourGraph
-from pansplat.tours.outlook import find_widest
+from pansplat.tours.outlook import find_bins, find_turns, find_widest
 
-FADE_SECONDS = 1.0
-NEAR_OF_FAR = 0.03  # of a tour: Gaussians within this fraction of far are not drawn, because ways pass door frames
+FADE_SECONDS = 1.0  # duration of the fade between two scenes
+NEAR_OF_FAR = 0.03  # Gaussians of a tour within this fraction of far are not drawn, because ways pass door frames
 STOP_REACH = 0.03  # metres from a panorama, within which its photograph is shown
 STOP_SECONDS = 0.2  # duration of the fade between scene and photograph
 REST_SECONDS = 3.0  # time at each panorama of a flight through a tour
 TURN_SECONDS, TURN_DEGREES = 0.4, 45.0  # time of a turn by at least that angle; a smaller turn takes less
-ZOOM_SECONDS = 0.7
+ZOOM_SECONDS = 0.7  # duration of a zoom
 _END_SECONDS = 0.1  # rest after a zoom, so that a route ends in the scene of its last panorama
 ZOOM = 2 / 3  # field of view at the end of a zoom, relative to that at its start
-LOWEST_PITCH = -0.2  # radians, the pitch towards a link, which may be on the floor
+LOWEST_PITCH = -0.2  # least pitch towards a link, which may be on the floor, radians
 FLIGHT_SECONDS = 1.0, 1.6  # least and largest duration of a flight
 SHORT_FLIGHT, METRE_SECONDS = 2.0, 0.1  # longest flight of the least duration, metres; time of each further metre
 _NEAR = 1.0  # distance of the first panorama below which the camera keeps its heading, metres
@@ -163,7 +163,8 @@ def plan_route(
     rest: float = 0.0,
     outlooks: Mapping[int, Float[np.ndarray, "bin"]] | None = None,
 ) -> Route:
-    """A way along a walk. It ends in the start view of its last panorama, else in the direction of arrival.
+    """A way along a walk. It ends in the start view of its last panorama, else in the direction of arrival, turned from
+    a wall that is close.
 
     Args:
         tour: the graph.
@@ -171,8 +172,8 @@ def plan_route(
         start: pose from which the first node is approached; None starts at that node, in the direction of its start
             view, or of the second node.
         rest: seconds at each panorama on the first visit, in its start view.
-        outlooks: of panoramas (`measure_outlook`), in whose widest view a zoom to another world ends if nothing else is
-            stated.
+        outlooks: of panoramas (`measure_outlook`), which show walls that are close (`find_turns`), and the widest view,
+            in which a zoom to another world ends if nothing else is stated.
     """
     planner = _Planner(tour, outlooks or {})
     planner.begin(walk, start)
@@ -181,7 +182,7 @@ def plan_route(
         is_visit = rest > 0 and node not in walk[:number] and (start is None or len(planner.steps) > 0)
         has_zoomed = len(planner.steps) > 0 and planner.steps[-1].kind == "zoom"
         if (is_visit or number == len(walk) - 1) and not has_zoomed:
-            planner.turn(find_start_angles(tour, node))
+            planner.turn(find_start_angles(tour, node) or planner.avoid_wall(node, *planner.camera[3:]))
         if is_visit:
             planner.add("rest", planner.camera, rest)
     if not planner.steps or planner.steps[-1].kind == "zoom":
@@ -257,25 +258,31 @@ class _Planner:
         """Yaw and pitch from a panorama to another one: of its place, or of the link to it; None if unknown."""
         link, away = self.tour.find_direction(start, end), self.places[end] - self.places[start]
         if link is not None and self.tour.is_fade(start, end):
-            yaw, pitch = find_angles(self.level.T @ link)
+            yaw, pitch = find_angles(link)
             return yaw, max(pitch, LOWEST_PITCH)
         return (math.atan2(away[0], away[2]), 0.0) if self.tour.worlds[start] == self.tour.worlds[end] else None
 
-    def find_arrival(self, start: int, end: int) -> Sequence[float]:
+    def find_arrival(self, start: int, end: int) -> tuple[float, float]:
         """Yaw and pitch at the end of a zoom: away from the link back, else the start view, else that of the way."""
         if (back := self.tour.find_direction(end, start)) is not None:
-            right, _, forward = -(self.level.T @ back)
-            return math.atan2(right, forward), 0.0
-        is_known = self.tour.worlds[start] == self.tour.worlds[end] or end not in self.outlooks
-        return find_start_angles(self.tour, end) or (
-            self.camera[3:].tolist() if is_known else (find_widest(self.outlooks[end]), 0.0)
-        )
+            right, _, forward = -back
+            return self.avoid_wall(end, math.atan2(right, forward), 0.0)
+        if (view := find_start_angles(self.tour, end)) is not None:
+            return view
+        if self.tour.worlds[start] != self.tour.worlds[end] and end in self.outlooks:
+            return find_widest(self.outlooks[end]), 0.0
+        return self.avoid_wall(end, *self.camera[3:])
+
+    def avoid_wall(self, node: int, yaw: float, pitch: float) -> tuple[float, float]:
+        """The yaw and pitch of an arrival, turned away from a wall that is close."""
+        turn = find_turns(self.outlooks[node])[find_bins(np.array(yaw))] if node in self.outlooks else 0.0
+        return float(yaw + turn), float(pitch)
 
 
 def find_start_angles(tour: TourGraph, node: int) -> tuple[float, float] | None:
     """Yaw and pitch, in level axes, of the view that a visitor of a panorama sees first; None if none is stated."""
-    view = tour.find_start_view(node)
-    return None if view is None else find_angles(tour.level_axes.T @ view)
+    start = tour.panoramas[node].start
+    return None if start is None else find_angles(tour.look(node, *start))
 
 
 def find_angles(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:

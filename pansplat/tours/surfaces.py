@@ -13,9 +13,12 @@ from torch import Tensor
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Scene
 
-RAYS = 360  # around a camera, of which walls are measured
+RAYS = 360  # number of directions around a camera in which walls are measured
 _SHOWN, _OPAQUE = 0.1, 0.5  # least opacities of surfaces, and of those that hide and block
-_ROWS, _COLUMNS = 180, 360  # of equal solid angles
+_ROWS, _COLUMNS = 180, 360  # cells of equal solid angles around a camera
+
+RAY_ANGLES = (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS  # azimuths from forward to the right, radians
+RAY_DIRECTIONS = np.stack((np.sin(RAY_ANGLES), np.cos(RAY_ANGLES)), axis=1)
 
 Outline = Float[np.ndarray, "corner 2"]
 
@@ -46,7 +49,7 @@ class Surfaces:
         """Those of opaque surfaces from the camera."""
         return np.linalg.norm(self.opaque, axis=1)
 
-    @property
+    @cached_property
     def colors(self) -> Float[np.ndarray, "m 3"]:
         """Those of opaque surfaces, without harmonics of higher degrees, in [0, 1]."""
         return (0.5 + SH_0 * self.base[self.is_opaque]).clamp(0, 1).double().numpy()
@@ -97,19 +100,9 @@ def split_by_azimuth(
     return np.split(values[order], np.searchsorted(sectors[order], np.arange(1, count)))
 
 
-def ray_angles() -> Float[np.ndarray, "ray"]:
-    """Azimuths from forward to the right, radians."""
-    return (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS
-
-
-def ray_directions() -> Float[np.ndarray, "ray 2"]:
-    angles = ray_angles()
-    return np.stack((np.sin(angles), np.cos(angles)), axis=1)
-
-
 def meet_outline(center: Float[np.ndarray, "2"], outline: Outline) -> tuple[np.ndarray, np.ndarray]:
     """Distance at which each ray meets the outline, and the number of that wall; infinite and -1 if it does not."""
-    rays, along = ray_directions(), np.roll(outline, -1, axis=0) - outline
+    rays, along = RAY_DIRECTIONS, np.roll(outline, -1, axis=0) - outline
     cross = rays[:, None, 0] * along[:, 1] - rays[:, None, 1] * along[:, 0]
     offset = outline - center
     with np.errstate(divide="ignore", invalid="ignore"):

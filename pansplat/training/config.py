@@ -19,7 +19,7 @@ from pansplat.training.losses import CODE, LossWeights, PerceptualName
 DataKind = Literal["room", "panogrf", "360loc", "pairs", "triplets"]
 NetworkShape = Literal["paper", "small", "tiny"]
 Part = Literal["features", "cost_volume", "heads"]
-Backpropagation = Literal["plain", "one-step", "two-step"]
+Backpropagation = Literal["plain", "two-step"]
 Style = Literal["panorama", "cubemap"]
 Mixing = Literal["joint", "by_view"]
 
@@ -70,7 +70,7 @@ class MemoryConfig:
     """How gradients are computed; affects memory and time only."""
 
     backpropagation: Backpropagation = "plain"
-    """plain: one graph. one-step: the heads tile by tile. two-step: the image face by face too."""
+    """plain: one graph. two-step: the image face by face, then the heads tile by tile."""
     tiles: Annotated[int, Meta(ge=1, le=64)] = 1
     """Number of tiles along each side of the panorama."""
     style: Style = "panorama"

@@ -8,8 +8,7 @@ recomputes one piece at a time with a graph, and backpropagates the gradient of 
                    cut 1                      cut 2                             cut 3
 
     plain     no cuts: `whole_loss` and its backward()
-    one-step  cuts 1 and 2: the heads, which need most memory, by tile and view; the image in one graph
-    two-step  cuts 1, 2 and 3: also the image, by cube face or strip
+    two-step  all cuts: the heads, which need most memory, by tile and view; the image by cube face or strip
 
 The gradients equal those of the plain method, because a piece depends only on the values at its cut.
 
@@ -22,7 +21,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float, Integer
@@ -80,7 +79,6 @@ def backpropagate(
     network: PanSplat,
     renderer: TargetRenderer,
     *,
-    method: Literal["one-step", "two-step"],
     tiles: int = 1,
     matching_is_trainable: bool = True,
 ) -> tuple[Float[Tensor, ""], LossTerms]:
@@ -96,15 +94,9 @@ def backpropagate(
     maps = Cut(_match(problem, network, matching_is_trainable))
     with torch.no_grad():
         tiled = [Cut(part, everything=True).leaves for part in network.lift_gaussians(maps.leaves, tiles=tiles)]
-    if method == "one-step":
-        loss, terms = problem.image_loss(
-            renderer.render_batch(merge_tiles(tiled, network.compat), problem.targets, problem.cam2world)
-        )
-        loss.backward()
-    else:
-        ordered = network.compat == "fixed"
-        scenes = [TiledGaussians(tiled, item, ordered=ordered) for item in range(len(problem.images))]
-        loss, terms = _backpropagate_parts(scenes, problem, renderer)
+    ordered = network.compat == "fixed"
+    scenes = [TiledGaussians(tiled, item, ordered=ordered) for item in range(len(problem.images))]
+    loss, terms = _backpropagate_parts(scenes, problem, renderer)
     match_loss, match_terms = problem.match_loss(maps.leaves)
     if match_loss is not None and match_loss.requires_grad:
         match_loss.backward()

@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 
 from pansplat.bench.scenes import NUM_SURFACES, trace_room
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.inputs.pairs import FAR, NEAR
+from pansplat.inputs.panorama_sets import FAR, NEAR
 from pansplat.inputs.views import Sample, Views
 
 _FREE_BOX = ((-2.0, -0.6, -1.7), (1.9, 0.6, 0.8))  # metres; corners of a box that is half a metre from all surfaces
@@ -31,7 +31,7 @@ class RoomTriplets:
     """A `SampleSource` of rooms.
 
     Attributes:
-        seed: of the rooms.
+        seed: seed of the random rooms.
         count: samples per epoch; larger indices are valid too.
     """
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import CAMERA_POSES, read_loc360_sequence
 from pansplat.inputs.folders import require_known_masks
-from pansplat.inputs.pairs import Pair, Panorama
-from pansplat.inputs.views import Sample, Views, select_views
+from pansplat.inputs.panorama_sets import PanoramaSet
+from pansplat.inputs.views import Sample, select_views
 from pansplat.system.files import expand_home
 
 Stage = Literal["train", "val"]
@@ -71,31 +68,11 @@ def _longest_gap(count: int) -> int:
     return count - 1
 
 
-@dataclass(frozen=True, eq=False)
-class ImageSequence:
-    """Posed panoramas in order. Frames without a mask file show the scene in all pixels."""
-
-    name: str
-    panoramas: tuple[Panorama, ...]
-    near: float
-    far: float
-
-    @property
-    def poses(self) -> Sequence[Float[Tensor, "4 4"]]:
-        """Camera to world of each frame, OpenCV axes, metres."""
-        return [panorama.cam2world for panorama in self.panoramas]
-
-    def read(self, frames: Sequence[int], height: int) -> Views:
-        """The given frames at (height, 2 height), in the order of `frames`."""
-        chosen = tuple(self.panoramas[frame] for frame in frames)
-        return Pair(self.name, chosen[0].image.parent, (), chosen, self.near, self.far).load_targets(height)
-
-
-def read_frame_pair(sequence: ImageSequence, pair: FramePair, height: int) -> Sample:
+def read_frame_pair(sequence: PanoramaSet, pair: FramePair, height: int) -> Sample:
     """The sample of a frame pair. Each frame is read once, even if it is both context and target."""
     frames = sorted({pair.left, pair.right, *pair.targets})
-    views = sequence.read(frames, height)
-    index = {frame: i for i, frame in enumerate(frames)}
+    chosen = replace(sequence, targets=tuple(sequence.targets[frame] for frame in frames))
+    views, index = chosen.load_targets(height), {frame: i for i, frame in enumerate(frames)}
     return Sample(
         f"{sequence.name}-{pair.left:06d}-{pair.right:06d}",
         select_views(views, [index[pair.left], index[pair.right]]),
@@ -103,8 +80,12 @@ def read_frame_pair(sequence: ImageSequence, pair: FramePair, height: int) -> Sa
     )
 
 
-def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
-    """The 360Loc sequences of a stage's locations, by name: ROOT/{location}/{mapping|query_360}/{*360*}/."""
+def read_loc360(root: Path | str, stage: Stage) -> list[PanoramaSet]:
+    """The 360Loc sequences of a stage's locations, by name: ROOT/{location}/{mapping|query_360}/{*360*}/.
+
+    The frames of a sequence, in order, are the targets of a set. Frames without a mask file show the scene in all
+    pixels.
+    """
     root = expand_home(root)
     sequences = []
     for location in LOCATIONS[stage]:
@@ -123,6 +104,6 @@ def read_loc360(root: Path | str, stage: Stage) -> list[ImageSequence]:
         for folder in folders:
             collection = read_loc360_sequence(folder / CAMERA_POSES, folder)
             require_known_masks(folder, collection.views)
-            name = f"{location}-{folder.name}"
-            sequences.append(ImageSequence(name, collection.panoramas, collection.near, collection.far))
+            name, frames = f"{location}-{folder.name}", collection.panoramas
+            sequences.append(PanoramaSet(name, folder, (), frames, collection.near, collection.far))
     return sequences

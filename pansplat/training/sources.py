@@ -16,20 +16,13 @@ import numpy as np
 
 from pansplat.errors import InputError
 from pansplat.inputs.folder_formats import find_panogrf, find_triplets, read_panogrf_scene, read_triplet
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Sample
 from pansplat.system.files import expand_home
 from pansplat.training.config import DataConfig
 from pansplat.training.room import RoomTriplets
-from pansplat.training.sequences import (
-    BoundedSampler,
-    FramePair,
-    ImageSequence,
-    Stage,
-    read_frame_pair,
-    read_loc360,
-)
+from pansplat.training.sequences import BoundedSampler, FramePair, Stage, read_frame_pair, read_loc360
 
 _VALIDATION_SEED_OFFSET = 1_000_003  # added to the seed, so that rooms differ from those of training
 _VALIDATION_DRAWS = 4  # frame pairs per sequence
@@ -49,7 +42,7 @@ class SampleSource(Protocol):
 class PairSource:
     """Pairs with targets; each is a sample. Files are read by `sample`."""
 
-    pairs: Sequence[Pair]
+    pairs: Sequence[PanoramaSet]
 
     def __post_init__(self) -> None:
         if not self.pairs:
@@ -79,13 +72,13 @@ class TripletSource:
         source = self.sources[index]
         is_triplet = source.is_file()
         collection = read_triplet(source, source.parent) if is_triplet else read_panogrf_scene(source, source)
-        (pair,) = collection.pairs()
+        (pair,) = collection.sets()
         if not pair.targets:
             raise InputError(f"{source}: needed three views (two inputs and a target between), got two; add one.")
         return _read_pair(dataclasses.replace(pair, siblings=()), height, seed)  # without detection of static content
 
 
-def _read_pair(pair: Pair, height: int, seed: int) -> Sample:
+def _read_pair(pair: PanoramaSet, height: int, seed: int) -> Sample:
     """The sample of a pair with one of its targets."""
     target = pair.targets[np.random.default_rng(seed).integers(len(pair.targets))]
     return Sample(
@@ -97,7 +90,7 @@ def _read_pair(pair: Pair, height: int, seed: int) -> Sample:
 class RandomFramePairs:
     """Random frame pairs for training; `draws` per sequence make an epoch."""
 
-    sequences: Sequence[ImageSequence]
+    sequences: Sequence[PanoramaSet]
     sampler: BoundedSampler
     draws: int = 1000
 
@@ -106,7 +99,7 @@ class RandomFramePairs:
 
     def sample(self, index: int, height: int, seed: int) -> Sample:
         sequence = self.sequences[index // self.draws]
-        pair = self.sampler.training(len(sequence.poses), np.random.default_rng((seed, index)))
+        pair = self.sampler.training(len(sequence.targets), np.random.default_rng((seed, index)))
         return read_frame_pair(sequence, pair, height)
 
 
@@ -118,8 +111,8 @@ class FixedFramePairs:
         choose: from a number of frames to frame pairs, such as `BoundedSampler().evaluation`.
     """
 
-    def __init__(self, sequences: Sequence[ImageSequence], choose: Callable[[int], Sequence[FramePair]]) -> None:
-        self.pairs = [(sequence, pair) for sequence in sequences for pair in choose(len(sequence.poses))]
+    def __init__(self, sequences: Sequence[PanoramaSet], choose: Callable[[int], Sequence[FramePair]]) -> None:
+        self.pairs = [(sequence, pair) for sequence in sequences for pair in choose(len(sequence.targets))]
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -181,4 +174,4 @@ def load_sources(config: DataConfig, height: int, seed: int) -> tuple[SampleSour
 
 
 def _read_pairs(folder: Path) -> PairSource:
-    return PairSource([pair for pair in load_pairs(folder) if pair.targets])
+    return PairSource([pair for pair in load_sets(folder) if pair.targets])

@@ -70,8 +70,7 @@ class TrainingStep:
             if loss.requires_grad:
                 loss.backward()
         else:
-            method = self.memory.backpropagation
-            loss, terms = backpropagate(problem, self.network, renderer, method=method, **options)
+            loss, terms = backpropagate(problem, self.network, renderer, **options)
         return {**dict.fromkeys(LOSS_TERMS, 0.0), **terms, "loss": loss.item()}
 
     def _depth_loss(self, batch: Batch, matched: MatchedViews) -> Tensor | None:

@@ -2,10 +2,10 @@
 // OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world, moved by its
 // origin. Matrices are arrays of rows.
 
-import { clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
+import { clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, fromAxes, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
-const SOFT = 0.3; // of the way to the limit of the camera, in which steps become shorter
+const SOFT = 0.3; // share of the way to the limit of the camera, at its end, in which steps become shorter
 
 // Camera to world; positive yaw turns right, positive pitch up (viewer/scene/camera.py). The device's motion adds a roll.
 export function rotationOf({ yaw, pitch, roll }) {
@@ -37,7 +37,7 @@ export function walk(right, up, forward) {
   if (state.doll.isOn || !state.sorted || !limit) return;
   const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
-  const step = plus(camera.position, HEADER.level.map((row) => dot(row, local)));
+  const step = plus(camera.position, fromAxes(HEADER.level, local));
   const target = limitStep(GRAPH, camera.position, step, currentPart());
   const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : findSpot(target).position;
   const before = distanceOf(camera.position, from), after = distanceOf(target, from);
@@ -57,6 +57,12 @@ export const isFixed = () => HEADER.limits[currentPart()] === 0;
 
 // The panorama at the camera, or that from which it looked at the doll's house.
 export const nodeHere = () => state.doll.isOn ? state.doll.node : nearestNode(camera.position);
+
+// The panorama within a distance of the camera, metres; null without one, and in the doll's house.
+export function nodeWithin(distance) {
+  const node = nodeHere();
+  return !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) <= distance ? node : null;
+}
 
 // A camera for a pose of share.js, some of whose values may be missing; its position is within the limits. What is missing
 // stays, in the doll's house that of before.
@@ -84,7 +90,7 @@ export function cameraFor({ position, yaw, pitch, fov }) {
 
 export const findSpot = (position) => HEADER.spots[nearestNode(position)];
 
-// Of the floor below a position: along an edge, between those of its panoramas.
+// The place of the floor below a position: along an edge, between those of its panoramas.
 export function floorPoint(position) {
   if (!edges.length) return findSpot(position).mark;
   const [from, to] = endsOfEdge(), [start, end] = [from, to].map((node) => GRAPH.positions[node]);
@@ -92,16 +98,16 @@ export function floorPoint(position) {
   return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
 }
 
-const MIN_WEIGHT = 1e-4; // of a view: with it, the other views fill the holes of a view at its own camera
+const MIN_WEIGHT = 1e-4; // least weight of a view: with it, the other views fill the holes of a view at its own camera
 
 // Weights of the views of a group in a picture of a position and a direction: blend_weights of pansplat. Other views
 // have weight 0.
 function groupWeights(group, position, forward) {
   const views = HEADER.groups[group], weights = HEADER.views.map(() => 0);
-  const distances = views.map((view) => distanceOf(position, HEADER.views[view].position));
+  const distances = views.map((view) => distanceOf(position, GRAPH.positions[view]));
   const nearest = Math.min(...distances);
   const closeness = views.map((view, i) => {
-    const ahead = dot(minus(HEADER.views[view].position, position), forward) / (distances[i] || 1);
+    const ahead = dot(minus(GRAPH.positions[view], position), forward) / (distances[i] || 1);
     return (distances[i] > 0 ? nearest / distances[i] : 1) * Math.exp(HEADER.ahead * ahead);
   });
   const sum = closeness.reduce((a, b) => a + b);

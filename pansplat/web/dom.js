@@ -27,6 +27,13 @@ export function showMore(isOpen) {
   byId("more").setAttribute("aria-expanded", isOpen);
 }
 
+// The text of the element before the script that runs. Both are removed: unlike text in a program, it is not kept.
+export function takeText() {
+  const { currentScript: script } = document, element = script.previousElementSibling;
+  [element, script].forEach((each) => each.remove());
+  return element.textContent;
+}
+
 // An element with children that are elements or text; text is never HTML.
 export function make(tag, className, ...children) {
   const element = document.createElement(tag);
@@ -35,9 +42,9 @@ export function make(tag, className, ...children) {
   return element;
 }
 
-const MAX_PIXELS = 3e6; // of the canvas: limits the memory of its render targets
+const MAX_PIXELS = 3e6; // largest number of pixels of the canvas, which limits the memory of its render targets
 
-// Of the canvas at the full resolution.
+// The size of the canvas at the full resolution, pixels.
 export function fullSize() {
   const { clientWidth, clientHeight } = canvas, ratio = Math.min(devicePixelRatio || 1, 2);
   const full = Math.min(ratio, Math.sqrt(MAX_PIXELS / (clientWidth * clientHeight || 1)));

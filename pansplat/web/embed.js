@@ -4,7 +4,7 @@ class Embed {
   constructor() {
     this.isFramed = window.parent !== window;
     this.isEngaged = !this.isFramed; // whether the wheel and vertical strokes of a finger are the page's
-    this.waiting = null; // for the end of a goTo
+    this.waiting = null; // the goTo whose end is awaited
     this.at = null;
   }
 
@@ -32,7 +32,7 @@ class Embed {
     });
   }
 
-  // In every frame: the panorama at a camera that has arrived, or null.
+  // Called in every frame with the panorama at a camera that has arrived, or null.
   follow(node, isMoving) {
     if (node !== null && node !== this.at) {
       const detail = { panorama: node + 1, name: HEADER.spots[node].name };

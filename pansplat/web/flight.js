@@ -1,19 +1,19 @@
 // Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump fades:
 // the image of the camera before covers the new one until that is there, then it fades out; that of a zoom grows.
 
-import { cameraFor, isFixed, nearestNode, nodeHere, settleAt, turn } from "./camera.js";
+import { cameraFor, isFixed, nearestNode, nodeHere, nodeWithin, settleAt, turn } from "./camera.js";
 import { chooseArrival, findHeading, headingTo } from "./choices.js";
 import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit, placeInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
-import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isFade, minus, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
+import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isFade, minus, nearestEdge, partOfEdge, plus, scaled, wrapAngle } from "./graph.js";
 import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
 import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, state } from "./state.js";
 
-const DOLL_SECONDS = 1.6; // of a flight out of the rooms, or into one
-const MAX_STILL = 8e6; // pixels of its image
+const DOLL_SECONDS = 1.6; // duration of a flight out of the rooms, or into one
+const MAX_STILL = 8e6; // pixels of the image of a still, whose memory it limits
 const NEAR = HEADER.speed; // metres: a second's walk
-export const PHOTO_WAIT_MS = 2000; // for a photograph, at most: where a zoom ends, and of the first Gaussians
+export const PHOTO_WAIT_MS = 2000; // longest wait for a photograph: at the end of a zoom, and before the first Gaussians are loaded
 
 export function jump(position, { yaw, pitch }, isZoom = false) {
   takeStill(isZoom);
@@ -87,7 +87,7 @@ export function enterAt(left, top) {
   visit(nearestInDoll(plus(camera.position, scaled(rayOf(left, top), distance))));
 }
 
-// Without a flight. `isDue`: it opens when its data is there.
+// Opens or closes the doll's house without a flight. `isDue`: it opens when its data is there.
 function setDoll(isOn, isDue = false) {
   const { doll } = state;
   if (doll.isOn && !isOn) camera.fov = doll.fov;
@@ -137,20 +137,19 @@ export function flyTo(spot) {
 function planWay(spot) {
   const part = edges.length ? partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)) : 0;
   const way = edges.length ? findWay(GRAPH, camera.position, spot, part) : [spot];
-  const here = nodeHere(), isThere = distanceOf(camera.position, GRAPH.positions[here]) <= HEADER.stopReach;
-  const legs = [];
-  let from = isThere ? here : null, position = [...camera.position], end = chooseArrival(spot, camera);
+  const here = nodeHere(), ahead = { yaw: camera.yaw, pitch: camera.pitch }, legs = [];
+  let from = nodeWithin(HEADER.stopReach), position = [...camera.position], heading = ahead, end = chooseArrival(spot, ahead);
   way.forEach((node, i) => {
     const before = i > 0 ? way[i - 1] : null, isZoom = before !== null && isFade(GRAPH, before, node);
     const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node); // a zoom begins where the camera is
     if (node === from || isLeft) return;
-    const heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || camera;
-    if (heading) legs.push({ view: { yaw: heading.yaw, pitch: heading.pitch } });
+    heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || ahead;
+    if (heading) legs.push({ view: heading });
     end = chooseArrival(node, heading, isZoom ? before : null);
     legs.push(isZoom ? { to: node, view: end } : { from, to: node, path: [position, GRAPH.positions[node]] });
     [from, position] = [node, GRAPH.positions[node]];
   });
-  if (!legs.length || legs.at(-1).path && HEADER.spots[spot].hasStart) legs.push({ view: end });
+  if (!legs.length || legs.at(-1).path && (HEADER.spots[spot].hasStart || end.yaw !== heading.yaw)) legs.push({ view: end });
   return { legs, end };
 }
 
@@ -185,8 +184,7 @@ function beginLeg(leg, now) {
   const [least, most] = HEADER.flightSeconds;
   if (leg.path) leg.seconds = clamp(least + HEADER.metreSeconds * (distanceOf(...leg.path) - HEADER.shortFlight), least, most);
   else if (leg.view && leg.to === undefined && !state.headset.session) { // the head turns itself
-    const { yaw, pitch } = leg.view, across = yaw - camera.yaw;
-    leg.turn = [Math.atan2(Math.sin(across), Math.cos(across)), pitch - camera.pitch];
+    leg.turn = [wrapAngle(leg.view.yaw - camera.yaw), leg.view.pitch - camera.pitch];
     leg.seconds = HEADER.turnSeconds * Math.min(Math.hypot(...leg.turn) / HEADER.turnAngle, 1);
   }
 }
@@ -232,8 +230,8 @@ export const isFlying = () => state.flight !== null;
 // The still, the image of the last camera before a jump, covers the new one until that is sorted, then it fades out.
 const stillCanvas = byId("still");
 
-// That of a zoom is large enough to grow.
-export function takeStill(isZoom = false) {
+// Takes the still from the picture; for a zoom it is large enough to grow.
+function takeStill(isZoom = false) {
   if (!state.renderer || !state.sorted) return;
   const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * HEADER.zoom * camera.fov * DEGREE) : 1;
   state.still = { taken: null, began: null, left: 1, position: null, isZoom, zoom };

@@ -1,5 +1,5 @@
-// Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of the methods of
-// pansplat.tours.graph.TourGraph that they name; tests/web/test_browser.py compares them.
+// Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of those of
+// pansplat.tours.graph, walks and limits that they name; tests/web/test_modules.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
 // on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; the `reach` around a part,
@@ -16,9 +16,15 @@ export const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 export const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 export const multiply = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, value, i) => sum + value * b[i][k], 0)));
 export const column = (matrix, k) => matrix.map((row) => row[k]);
+// A vector in axes that are the columns of a rotation, and back.
+/** @type {(axes: number[][], vector: number[]) => any} */
+export const inAxes = (axes, vector) => [0, 1, 2].map((k) => dot(column(axes, k), vector));
+export const fromAxes = (axes, vector) => axes.map((row) => dot(row, vector));
+export const unit = (vector) => scaled(vector, 1 / Math.max(Math.hypot(...vector), 1e-9));
 export const distanceOf = (a, b) => Math.hypot(...minus(a, b));
 export const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 export const ease = (t) => t * t * (3 - 2 * t);
+export const wrapAngle = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle)); // -pi to pi
 export const indexOfLeast = (values) => values.indexOf(Math.min(...values));
 
 export function closestOnEdge(graph, edge, position) {
@@ -28,7 +34,7 @@ export function closestOnEdge(graph, edge, position) {
   return plus(from, scaled(along, fraction));
 }
 
-// measure_distance
+// measure_distances, of one edge
 const distanceToEdge = (graph, edge, position) => distanceOf(position, closestOnEdge(graph, edge, position));
 
 export const partOfEdge = (graph, edge) => graph.parts[graph.edges[edge][0]];
@@ -75,11 +81,14 @@ function measureFree(graph, edge, place) {
   return [Math.max(free, beside), away];
 }
 
+// find_bin, of a horizon of `count` bins
+export const findBin = (yaw, count) => Math.floor((wrapAngle(yaw) / (2 * Math.PI) + 0.5) * count) % count;
+
 // find_clearance
 function findClearance(graph, node, offset) {
-  const [right, down, forward] = [0, 1, 2].map((k) => dot(column(graph.level, k), offset)), table = graph.clearances[node], [{ length }] = table;
+  const [right, down, forward] = inAxes(graph.level, offset), table = graph.clearances[node];
   const row = Math.min(Math.floor(Math.atan2(Math.hypot(right, forward), -down) / Math.PI * table.length), table.length - 1);
-  return table[row][Math.floor((Math.atan2(right, forward) / (2 * Math.PI) + 0.5) * length) % length] || Infinity;
+  return table[row][findBin(Math.atan2(right, forward), table[row].length)] || Infinity;
 }
 
 // _limit_along

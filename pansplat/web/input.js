@@ -46,6 +46,7 @@ function onHeld() {
 function onKey(event) {
   /** @type {HTMLDialogElement} */
   const open = document.querySelector("dialog[open]");
+  state.isFast = event.shiftKey;
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   if (open) {
     if (open.id !== CLOSES[event.code] || event.repeat) return;
@@ -162,9 +163,6 @@ function toggleFull() {
 
 export function listen() {
   addEventListener("keydown", onKey);
-  addEventListener("keydown", (event) => {
-    state.isFast = event.shiftKey;
-  });
   addEventListener("keyup", (event) => {
     state.isFast = event.shiftKey;
     held.delete(event.code);
@@ -205,9 +203,7 @@ export function listen() {
   byId("play").onclick = () => setTouring(!state.isTouring);
   byId("home").onclick = goHome;
   byId("place").onclick = openList;
-  byId("list").onclick = (event) => {
-    if (event.target === byId("list")) byId("list").close();
-  }; // beside it
+  byId("list").onclick = ({ target }) => target === byId("list") && target.close(); // a click beside the dialog
   byId("map").onclick = () => plan.toggle();
   byId("doll").onclick = toggleDoll;
   byId("doll").hidden = !HEADER.doll.length;

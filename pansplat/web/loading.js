@@ -2,18 +2,18 @@
 // has all views; one with a folder loads those that the camera needs.
 
 import { nodeHere } from "./camera.js";
-import { byId, canvas, say } from "./dom.js";
+import { byId, canvas, say, takeText } from "./dom.js";
 import { camera, currentPart, edges, isComplete, isSortedFor, parts, refresh, state } from "./state.js";
 
-const SILENCE_MS = 10000;                  // of a server, after which a request has failed
-export const TRIES = 3, PAUSE_AFTER_ERROR = 2000;  // of a file that does not arrive, ms between them
-const GZIP = 0x8b1f;                       // its first two bytes
+const SILENCE_MS = 10000; // silence of a server after which a request has failed
+export const TRIES = 3, PAUSE_AFTER_ERROR = 2000; // tries of a file that does not arrive, and milliseconds between two
+const GZIP = 0x8b1f; // the first two bytes of a gzip
 const MISSING = "A part of the scene did not arrive. Load the page again; if that does not help, copy the whole folder.";
 
 export let failure = null;
 let worker = null, chunksArrived = 0;
-let queue = Promise.resolve();             // of files: the first view comes first
-let fails = fail;                          // reports an error of the data
+let queue = Promise.resolve(); // loads one file after the other; the first view comes first
+let fails = fail; // the function that reports an error of the data
 
 export function fail(error) {
   if (failure) return;
@@ -32,14 +32,8 @@ function receive(view, isLast, chunk) {
   if (worker) worker.postMessage({ view, chunk, isLast });
 }
 
-// In a page of one file a script for each chunk of the data calls this. The chunk is the element before: unlike text in a
-// program, it is not kept.
-window.addPart = (view, isLast) => {
-  const { currentScript: script } = document, { previousElementSibling: element } = script;
-  element.remove();
-  script.remove();
-  receive(view, isLast, element.textContent);
-};
+// In a page of one file a script for each chunk of the data calls this.
+window.addPart = (view, isLast) => receive(view, isLast, takeText());
 
 // A file of the folder beside the page. A cache may hold what a server has answered in its place before.
 export async function fetchFile(name, isAgain) {
@@ -62,7 +56,7 @@ export async function fetchFile(name, isAgain) {
 function loadView(view, tries = 1) {
   queue = queue.then(async () => {
     const blob = await fetchFile(...HEADER.views[view].files, tries > 1), chunk = await blob.arrayBuffer();
-    if (new Uint16Array(chunk.slice(0, 2))[0] !== GZIP) throw new Error("this is no gzip");  // but a page of the server
+    if (new Uint16Array(chunk.slice(0, 2))[0] !== GZIP) throw new Error("this is no gzip"); // but a page of the server
     state.missing.delete(view);
     receive(view, true, chunk);
   }).catch(() => {

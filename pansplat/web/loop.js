@@ -1,12 +1,12 @@
 // Frames. One is drawn only if something changed. While the picture moves, the scale of its resolution follows the time
 // between frames; at rest it has the full resolution.
 
-import { nodeHere, showViews, tangentOf, updateEdge, walk } from "./camera.js";
+import { nodeWithin, showViews, tangentOf, updateEdge, walk } from "./camera.js";
 import { orbitByKeys } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { embed } from "./embed.js";
 import { advanceDollFlight, advanceFlight, isWaiting, updateStill } from "./flight.js";
-import { clamp, column, distanceOf, dot, minus, scaled } from "./graph.js";
+import { clamp, inAxes, minus, scaled } from "./graph.js";
 import { loadAround, requestSort } from "./loading.js";
 import { measure } from "./measure.js";
 import { placeNotes } from "./notes.js";
@@ -14,15 +14,15 @@ import { photographs } from "./photographs.js";
 import { drawAt } from "./picture.js";
 import { plan } from "./plan.js";
 import { placeRings, showPlace } from "./rings.js";
-import { camera, currentPart, edges, GRAPH, isComplete, isSortedFor, shown, state } from "./state.js";
+import { camera, currentPart, edges, isComplete, isSortedFor, shown, state } from "./state.js";
 
-const SLOW_MS = 45, FAST_MS = 25; // of a frame: above, the resolution falls; below, it rises
+const SLOW_MS = 45, FAST_MS = 25; // times of a frame: above the first the resolution falls, below the second it rises
 const PAUSE_MS = 1000; // a longer frame is not measured
 const REST_MS = 200; // after a change, until the full resolution is drawn
 export const SORT_DISTANCE = 0.01; // metres from the point for which a headset's Gaussians are sorted
-const LEAST_SCALE = 0.25; // of the resolution
-const EXPOSURE_MS = 1000 / 30; // of a frame of a flight, at most, by which its Gaussians blur
-const scales = [1, 1]; // of the resolution while it moves: of Gaussians, and of photographs
+const LEAST_SCALE = 0.25; // scale of the resolution, at least
+const EXPOSURE_MS = 1000 / 30; // longest exposure of a frame of a flight, during which its Gaussians blur
+const scales = [1, 1]; // scales of the resolution while the picture moves: that of Gaussians, and that of photographs
 let lastFrame = 0;
 
 // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
@@ -42,9 +42,8 @@ export function advance(now, seconds) {
   photographs.update(seconds);
   updateStill(now);
   loadAround();
-  const node = nodeHere(), isMoving = state.flight !== null || state.doll.flight !== null || isWaiting();
-  const isThere = !isMoving && !state.doll.isOn && distanceOf(GRAPH.positions[node], camera.position) < HEADER.ringRadius;
-  embed.follow(isThere ? node : null, isMoving);
+  const isMoving = state.flight !== null || state.doll.flight !== null || isWaiting();
+  embed.follow(isMoving ? null : nodeWithin(HEADER.ringRadius), isMoving);
 }
 
 export function onFrame(now) {
@@ -74,7 +73,7 @@ export function onFrame(now) {
 
 function showMarks(rotation) {
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
-  const toCamera = (point) => [0, 1, 2].map((k) => dot(column(rotation, k), minus(point, camera.position)));
+  const toCamera = (point) => inAxes(rotation, minus(point, camera.position));
   const toWindow = ([x, y, z]) => [0.5 * width + focal * x / z, 0.5 * height + focal * y / z];
   measure.show(toCamera, toWindow);
   placeNotes(rotation, toWindow);

@@ -7,8 +7,8 @@ import { measureAt, rayOf } from "./picture.js";
 import { camera, changed, state } from "./state.js";
 
 const SVG = byId("marks").namespaceURI;
-const SINGLE_ERROR = 0.35; // of a distance in a panorama alone: heights of cameras over the floor differ by as much
-const NEAREST = 0.02; // z of the ends of a line, of the distance of its farther end
+const SINGLE_ERROR = 0.35; // relative error of a distance in a panorama alone: heights of cameras over the floor differ by as much
+const NEAREST = 0.02; // least z of the ends of a line, as a share of the distance of its farther end
 
 function drawSvg(tag, attributes, text = "") {
   const element = document.createElementNS(SVG, tag);

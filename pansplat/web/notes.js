@@ -1,10 +1,9 @@
 // What a tour says about a place in a panorama: a marker in its direction, at the panorama, opens a text box. Texts and
 // addresses are those of the tour's author; text is never HTML.
 
-import { nodeHere } from "./camera.js";
+import { nodeWithin } from "./camera.js";
 import { byId, explain, make } from "./dom.js";
-import { column, distanceOf, dot } from "./graph.js";
-import { camera, GRAPH, state } from "./state.js";
+import { inAxes } from "./graph.js";
 
 let markers = [];
 
@@ -24,10 +23,10 @@ export function makeNotes() {
 
 // `toWindow`: from camera axes.
 export function placeNotes(rotation, toWindow) {
-  const here = nodeHere(), isThere = !state.doll.isOn && distanceOf(GRAPH.positions[here], camera.position) < HEADER.ringRadius;
+  const here = nodeWithin(HEADER.ringRadius);
   for (const { node, direction, button } of markers) {
-    const place = [0, 1, 2].map((k) => dot(column(rotation, k), direction)), [left, top] = toWindow(place);
-    button.hidden = !isThere || node !== here || place[2] < 0.1;
+    const place = inAxes(rotation, direction), [left, top] = toWindow(place);
+    button.hidden = node !== here || place[2] < 0.1;
     button.style.transform = `translate(${left - 22}px, ${top - 22}px)`;
   }
 }

@@ -17,7 +17,7 @@ import { parsePose, poseOf } from "./share.js";
 import { camera, changed, currentPart, isComplete, isSortedFor, redraw, shown, state } from "./state.js";
 import { headset } from "./xr.js";
 
-const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later"; // that have all that the page uses
+const BROWSERS = "Chrome or Edge 92, Firefox 113, Safari 16.4 or later"; // versions that have all that the page uses
 const FROM_DISK =
   "Browsers read this folder only from a web server. Upload it, or show it with pansplat export --serve. A page that opens from disk is a file: export to a name that ends in .html.";
 const lack = (what) => new Error(`This page needs ${what}, which is in ${BROWSERS}, unless the device lacks it.`);
@@ -52,7 +52,7 @@ async function main() {
     if (state.renderer) state.renderer.add(data);
     if (isComplete()) canvas.ariaBusy = false;
   });
-  loading.catch(() => {}); // of an error that comes before it is awaited
+  loading.catch(() => {}); // an error that comes before it is awaited is reported later
   const gl = canvas.getContext("webgl2", { alpha: false, powerPreference: "high-performance" });
   if (!gl) throw lack("WebGL 2");
   headset.gl = gl;
@@ -116,7 +116,7 @@ function findNode(panorama) {
   return node;
 }
 
-// For scripts: docs/web.md, Embedding. An EventTarget.
+// What scripts use, an EventTarget: docs/web.md, Embedding.
 window.pansplat = Object.assign(new EventTarget(), {
   camera,
   panoramas: HEADER.spots.map(({ name }) => name),

@@ -1,9 +1,9 @@
 // The photographs of the panoramas: where the camera stands at one, its photograph is shown, and Gaussians while it moves.
 // docs/web.md describes it. Tiles of cube faces are files, or text in a page of one file. A large level is drawn over the smallest one, as far as it has arrived.
 
-import { isFixed, nodeHere, rotationOf, tangentOf } from "./camera.js";
-import { fullSize, say } from "./dom.js";
-import { clamp, column, distanceOf, dot, minus, multiply, scaled } from "./graph.js";
+import { isFixed, nodeHere, nodeWithin, rotationOf, tangentOf } from "./camera.js";
+import { fullSize, say, takeText } from "./dom.js";
+import { clamp, column, distanceOf, dot, fromAxes, inAxes, minus, multiply, scaled, unit } from "./graph.js";
 import { fetchFile, PAUSE_AFTER_ERROR, TRIES } from "./loading.js";
 import { camera, changed, GRAPH, refresh, state } from "./state.js";
 
@@ -11,7 +11,7 @@ const DENSITY = 1.3; // texels of a pixel in the middle of a face, at least
 const KEPT = 3; // photographs whose textures are kept
 const AT_ONCE = 6; // tiles that are read at the same time
 const SMALL_FACE = 2048; // largest face on a phone, texels
-// Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number among those of OpenGL.
+// Right, down and forward of each face (pansplat.geometry.cubemap.FACES), and its number in OpenGL.
 const FACES = [
   [[1, 0, 0], [0, 1, 0], [0, 0, 1], 4],
   [[0, 0, -1], [0, 1, 0], [1, 0, 0], 0],
@@ -20,16 +20,10 @@ const FACES = [
   [[1, 0, 0], [0, 0, 1], [0, -1, 0], 2],
   [[1, 0, 0], [0, 0, -1], [0, 1, 0], 3],
 ];
-const texts = new Map(); // of a page in one file: base64 of the tiles that have arrived
+const texts = new Map(); // base64 of the tiles that have arrived in a page of one file
 
-// In a page of one file there is a script for the smallest tiles of a photograph and one for the others; they are in the
-// element before.
-window.addTile = (name, number) => {
-  const { currentScript: script } = document, { previousElementSibling: element } = script;
-  element.textContent.split(" ").forEach((each, k) => texts.set(`${name}_${number + k}`, each));
-  element.remove();
-  script.remove();
-};
+// In a page of one file a script for the smallest tiles of a photograph calls this, and one for the others.
+window.addTile = (name, number) => takeText().split(" ").forEach((each, k) => texts.set(`${name}_${number + k}`, each));
 
 async function readTile({ key, tries }) {
   if (HEADER.folder !== null) {
@@ -60,7 +54,7 @@ class Level {
         for (let across = 0; across < count; across++) {
           const [x, y] = [across, row].map((k) => (2 * k + 1) * step / size - 1);
           const ray = [0, 1, 2].map((k) => x * right[k] + y * down[k] + forward[k]);
-          const direction = scaled(rotation.map((axis) => dot(axis, ray)), 1 / Math.hypot(...ray));
+          const direction = unit(fromAxes(rotation, ray));
           const reach = Math.atan(Math.SQRT2 * step / size);
           const key = `${name}_${first + this.tiles.length}`, place = { face, x: across * step, y: row * step };
           this.tiles.push({ key, ...place, direction, reach, status: null, tries: 0, due: 0 });
@@ -131,8 +125,7 @@ class Photographs {
 
   // The panorama at which the camera stands, as no eye of a headset does; the nearest where there is nothing else to show.
   findNode() {
-    const node = nodeHere(), isThere = !state.headset.session && distanceOf(GRAPH.positions[node], camera.position) <= HEADER.stopReach;
-    return !state.doll.isOn && (isThere || isFixed()) ? node : null;
+    return nodeWithin(isFixed() ? Infinity : state.headset.session ? -1 : HEADER.stopReach);
   }
 
   // What is shown of a flight: the photographs of both ends, near them.
@@ -258,12 +251,11 @@ class Photographs {
     levels[0].bind(0);
     (chosen.texture ? chosen : levels.filter(({ texture }) => texture).at(-1)).bind(1);
     // The rows of the inverse are the columns of the rotation; y of a cube map is up.
-    const inverse = [0, 1, 2].map((k) => column(rotation, k)), turned = multiply(inverse, HEADER.photographs[this.node].rotation);
+    const turned = multiply([0, 1, 2].map((k) => column(rotation, k)), HEADER.photographs[this.node].rotation);
     gl.uniformMatrix3fv(places.camera_to_cube, false, turned.flatMap(([x, y, z]) => [x, -y, z]));
     const offset = minus(camera.position, GRAPH.positions[this.node]), away = Math.hypot(...offset);
     const part = state.headset.session ? 0 : Math.min(1 / HEADER.surfaces, HEADER.mostBeside / Math.max(away, 1e-9));
-    const beside = scaled(offset, part);
-    gl.uniform3fv(places.beside, inverse.map((axis) => dot(axis, beside)));
+    gl.uniform3fv(places.beside, inAxes(rotation, scaled(offset, part)));
     gl.uniform4f(places.window, ...center, ...half);
     gl.uniform2f(places.size, width, height);
     gl.uniform1f(places.opacity, this.opacity);

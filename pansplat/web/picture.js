@@ -3,7 +3,7 @@
 import { blendWeights, isFixed, nodeHere, rotationOf, tangentOf } from "./camera.js";
 import { findHouse, meetHouse, placeInDoll } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
-import { dot, minus, plus, scaled } from "./graph.js";
+import { fromAxes, minus, plus, unit } from "./graph.js";
 import { drawHouse } from "./house.js";
 import { photographs } from "./photographs.js";
 import { camera, changed, state } from "./state.js";
@@ -25,10 +25,7 @@ function planeOf(left, top) {
   return [(left - 0.5 * width) * step, (top - 0.5 * height) * step];
 }
 
-export function rayOf(left, top) {
-  const ray = [...planeOf(left, top), 1];
-  return scaled(rotationOf(camera).map((row) => dot(row, ray)), 1 / Math.hypot(...ray));
-}
+export const rayOf = (left, top) => unit(fromAxes(rotationOf(camera), [...planeOf(left, top), 1]));
 
 // The distance from the camera to what a point of the window shows, or null.
 export function measureAt(left, top) {

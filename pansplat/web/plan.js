@@ -3,10 +3,8 @@
 import { byId, make } from "./dom.js";
 import { resizeDoll } from "./doll.js";
 import { goTo } from "./flight.js";
-import { column, DEGREE, distanceOf, dot, indexOfLeast, minus } from "./graph.js";
-import { camera, changed, state } from "./state.js";
-
-const flat = (position) => [0, 2].map((k) => dot(column(HEADER.level, k), position));
+import { DEGREE, distanceOf, inAxes, indexOfLeast, minus } from "./graph.js";
+import { camera, changed, GRAPH, state } from "./state.js";
 
 class Plan {
   panel = byId("plan");
@@ -19,16 +17,19 @@ class Plan {
   toggle() {
     this.panel.hidden = this.isOpen;
     byId("map").setAttribute("aria-pressed", this.isOpen);
-    state.doll.covered = this.isOpen ? this.panel.getBoundingClientRect().right : 0;
+    if (this.isOpen && this.buttons === null) this.make();
+    const { right, bottom } = this.panel.getBoundingClientRect(); // 0 while it is hidden
+    state.doll.covered = [right, bottom];
     if (state.doll.isOn) resizeDoll(state.doll.size);
     changed();
   }
 
   make() {
-    const { drawing, size, places } = HEADER.plan, picture = make("img", ""), [wide, tall] = size;
+    const { drawing, size, places, isSure } = HEADER.plan, picture = make("img", ""), [wide, tall] = size;
     picture.src = `data:image/svg+xml;base64,${drawing}`;
     picture.alt = "";
     this.camera = byId("here");
+    byId("legend").hidden = isSure;
     byId("drawing").style.aspectRatio = wide / tall;
     this.buttons = places.map(([x, y], node) => {
       const button = make("button", "");
@@ -48,9 +49,8 @@ class Plan {
 
   show() {
     if (!this.isOpen) return;
-    if (this.buttons === null) this.make();
     const { size, places } = HEADER.plan, [x, y, turn] = places[state.here], [c, s] = [Math.cos(turn), Math.sin(turn)];
-    const [right, forward] = minus(flat(camera.position), flat(HEADER.spots[state.here].position));
+    const [right, , forward] = inAxes(HEADER.level, minus(camera.position, GRAPH.positions[state.here]));
     const left = (x + c * right + s * forward) / size[0], top = (y + s * right - c * forward) / size[1];
     Object.assign(this.camera.style, { left: `${100 * left}%`, top: `${100 * top}%`, rotate: `${(camera.yaw + turn) / DEGREE}deg` });
     this.camera.toggleAttribute("hidden", turn === null);

@@ -1,6 +1,6 @@
 // Draws the Gaussians of HEADER's views with WebGL 2 (docs/rendering.md), as they arrive.
 
-import { column, dot, scaled } from "./graph.js";
+import { inAxes, scaled, unit } from "./graph.js";
 
 const TEXTURE_WIDTH = 2048; // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
@@ -188,7 +188,7 @@ export class Renderer {
     // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
     gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
     gl.uniform3fv(places.position, position);
-    gl.uniform3fv(places.shift, [0, 1, 2].map((k) => dot(column(rotation, k), shift) / Math.sqrt(12)));
+    gl.uniform3fv(places.shift, scaled(inAxes(rotation, shift), 1 / Math.sqrt(12)));
     gl.uniform1f(places.near, HEADER.near);
     gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
     gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);
@@ -197,7 +197,7 @@ export class Renderer {
     gl.uniform2f(places.principal, 0.5 * width - x * focal[0], 0.5 * height + y * focal[1]);
     gl.uniform2fv(places.focal, focal);
     gl.uniform2fv(places.color_range, HEADER.colorRange);
-    const sides = [[-1, 0, w + x], [1, 0, w - x], [0, -1, h + y], [0, 1, h - y]].map((side) => scaled(side, 1 / Math.hypot(...side)));
+    const sides = [[-1, 0, w + x], [1, 0, w - x], [0, -1, h + y], [0, 1, h - y]].map(unit);
     gl.uniform3fv(places.sides, sides.flat());
     gl.uniform1i(places.geometry, 0);
     gl.uniform1i(places.colors, 1);

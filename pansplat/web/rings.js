@@ -5,12 +5,12 @@ import { chooseRings, findLink, isCovered } from "./choices.js";
 import { isInDoll, placeInDoll } from "./doll.js";
 import { byId, canvas, make } from "./dom.js";
 import { goTo } from "./flight.js";
-import { clamp, column, distanceOf, dot, minus } from "./graph.js";
+import { clamp, column, distanceOf, dot, inAxes, minus, wrapAngle } from "./graph.js";
 import { camera, state } from "./state.js";
 
 const ARROW = 44, BORDER = 8; // pixels: size of an arrow, and to the border
-const MAX_ARROWS = 3; // at a side of the picture
-let rings = [], chosenFor = null, chosen = []; // for a panorama
+const MAX_ARROWS = 3; // largest number of arrows at a side of the picture
+let rings = [], chosenFor = null, chosen = []; // all rings; the nearest panorama, and its rings
 
 export function makeRings() {
   const links = HEADER.links.filter((link) => link.mark);
@@ -43,15 +43,15 @@ function update() {
   }
 }
 
-// Those of the nearest panorama, without that at the camera; of the doll's house all in it.
+// The rings of the nearest panorama, without that at the camera; in the doll's house those of all panoramas in it.
 export function findRings() {
   update();
   if (state.doll.isOn) return rings.filter(({ link, node }) => !link && isInDoll(node));
   return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= HEADER.ringDistance);
 }
 
-// Rings in perspective, and arrows at the border to those that are outside or under a control; none while the camera flies. A
-// label that would cover a control or the label of a nearer ring is not shown.
+// Rings in perspective, and arrows at the border to those that are outside or under a control, and to panoramas of which no place
+// is known; none while the camera flies. A label that would cover a control or the label of a nearer ring is not shown.
 export function placeRings(rotation) {
   const found = state.flight?.legs[0].path ? [] : findRings();
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
@@ -59,9 +59,10 @@ export function placeRings(rotation) {
   const taken = [...bars], sides = { left: 0, right: 0, up: 0, down: 0 };
   for (const { button } of rings) button.hidden = true;
   const placed = found.map((ring) => {
+    const isKnown = ring.link || state.doll.isOn || HEADER.plan.worlds[ring.node] === HEADER.plan.worlds[nodeHere()];
     const isMoved = state.doll.isOn && isInDoll(ring.node), mark = isMoved ? placeInDoll(ring.node, ring.mark).place : ring.mark;
-    const offset = minus(mark, camera.position), [x, y, z] = [0, 1, 2].map((k) => dot(column(rotation, k), offset));
-    return { ring, offset, distance: Math.hypot(...offset), place: findPlace(ring, [x, y, z], focal, bars) };
+    const offset = minus(mark, camera.position);
+    return { ring, offset, distance: Math.hypot(...offset), place: isKnown ? findPlace(ring, inAxes(rotation, offset), focal, bars) : null };
   });
   for (const { ring, offset, place } of placed.sort((a, b) => Number(!a.place) - Number(!b.place) || a.distance - b.distance)) {
     const { button, label } = ring, { style } = button, found = place ? { box: place, side: null } : findBorder(offset, focal, sides, taken);
@@ -91,8 +92,8 @@ function findPlace({ isUpright }, [x, y, z], focal, bars) {
 
 // The `box` of an arrow to where the camera turns towards an offset, and its `side`; null where the side is full.
 function findBorder(offset, focal, sides, taken) {
-  const { clientWidth: width, clientHeight: height } = canvas, [right, down, forward] = [0, 1, 2].map((k) => dot(column(HEADER.level, k), offset));
-  const across = Math.atan2(right, forward) - camera.yaw, around = Math.atan2(Math.sin(across), Math.cos(across));
+  const { clientWidth: width, clientHeight: height } = canvas, [right, down, forward] = inAxes(HEADER.level, offset);
+  const around = wrapAngle(Math.atan2(right, forward) - camera.yaw);
   const above = -Math.atan2(down, Math.hypot(right, forward)) - camera.pitch, isBeside = Math.abs(around) > Math.atan(0.5 * width / focal);
   const side = state.doll.isOn ? null : isBeside ? around < 0 ? "left" : "right" : above > 0 ? "up" : "down";
   if (side === null || sides[side] === MAX_ARROWS) return null;
@@ -102,7 +103,7 @@ function findBorder(offset, focal, sides, taken) {
   const at = [0.5 * width + x - half, 0.5 * height + y - half];
   const inward = { left: [1, 0], right: [-1, 0], up: [0, 1], down: [0, -1] }[side], steps = [...Array(40).keys()].map((k) => (k % 2 ? 1 : -1) * half * Math.ceil(k / 2));
   const boxes = [0, 1, 2].flatMap((row) =>
-    steps.map((step) => { // beside the place, else above what is there
+    steps.map((step) => { // beside the place, else in a row above it
       const [left, top] = at.map((value, k) => clamp(value + (inward[k] ? 0 : step), BORDER, most[k]) + row * (ARROW + BORDER) * inward[k]);
       return [left, top, left + ARROW, top + ARROW];
     })

@@ -2,14 +2,12 @@
 // stands in the hash of the address as #at=x,y,z,yaw,pitch,fov.
 
 import { explain, say } from "./dom.js";
-import { DEGREE } from "./graph.js";
+import { DEGREE, wrapAngle } from "./graph.js";
 import { takePicture } from "./picture.js";
 import { camera } from "./state.js";
 
-const turnsOf = (radians) => Math.atan2(Math.sin(radians), Math.cos(radians)) / DEGREE;
-
 export function poseOf({ position, yaw, pitch, fov }) {
-  return { position: [...position], yaw: turnsOf(yaw), pitch: pitch / DEGREE, fov };
+  return { position: [...position], yaw: wrapAngle(yaw) / DEGREE, pitch: pitch / DEGREE, fov };
 }
 
 function formatPose(pose) {

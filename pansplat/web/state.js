@@ -10,14 +10,17 @@ export const GRAPH = {
   clearances: HEADER.spots.map((spot) => spot.clearances),
 };
 
-export const makeStart = () => ({ ...HEADER.start, position: [...HEADER.start.position], roll: 0 });
+export function makeStart() {
+  const { position, ahead: [yaw, pitch] } = HEADER.spots[HEADER.walk[0]];
+  return { position: [...position], yaw, pitch, roll: 0, fov: HEADER.startFov };
+}
 export const camera = makeStart();
 
 // How far each view has faded in. The first ones are there at once.
 export const shown = HEADER.views.map(() => 0);
 
 export const state = {
-  // At the camera; `fade`: from the views of another group.
+  // The edge at the camera, and the group that is blended there; `fade` is from the views of another group.
   edge: 0,
   group: edges.length ? edges[0][2] : 0,
   fade: null,
@@ -29,7 +32,7 @@ export const state = {
   sorted: null,
   isSorting: false,
   renderer: null, // null while the graphics are lost
-  // Of the picture: whether it is old, its scale, and when it changed last.
+  // Whether the picture is old, its scale, and when it changed last.
   isDirty: true,
   drawnScale: 0,
   lastChange: 0,
@@ -37,7 +40,7 @@ export const state = {
   flight: null,
   isTouring: false,
   still: null,
-  doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: 0 },
+  doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: [0, 0] },
   headset: { session: null, turnTo(_yaw) {} }, // xr.js
   here: null, // the panorama at the camera of the last frame
   step: [0, 0, 0], // right, up and forward, by the keys that are held

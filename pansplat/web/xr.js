@@ -7,7 +7,7 @@
 import { blendWeights, findSpot, floorPoint, walk } from "./camera.js";
 import { byId, calm, explain } from "./dom.js";
 import { coverage, goHome, goTo, isFlying, jumpTo, setTouring } from "./flight.js";
-import { clamp, column, cross, distanceOf, dot, minus, multiply, plus, scaled } from "./graph.js";
+import { clamp, column, cross, distanceOf, dot, fromAxes, minus, multiply, plus, scaled, unit } from "./graph.js";
 import { requestSort } from "./loading.js";
 import { advance, SORT_DISTANCE } from "./loop.js";
 import { photographs } from "./photographs.js";
@@ -15,21 +15,20 @@ import { findRings } from "./rings.js";
 import { camera, changed, state } from "./state.js";
 
 const XR_FEATURES = ["local-floor", "hand-tracking"];
-const XR_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]; // of WebXR to OpenCV, and back
+const XR_AXES = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]; // from the axes of WebXR to those of OpenCV, and back
 const SNAP_TURN = Math.PI / 6; // radians
-const DEAD_ZONE = 0.2; // of a stick
+const DEAD_ZONE = 0.2; // deflection of a stick below which it is at rest, 0 to 1
 const MIN_POINTING = 0.06; // radians between a ray and the centre of a ring that it selects
 const RAY_LENGTH = 3; // metres
-const FLOOR_SPEED = 5; // of the way to the height of a new floor, a second
-const HEIGHT_RATIO = 1.5; // of the head to the panorama's camera, both over their floors
+const FLOOR_SPEED = 5; // share of the way to the height of a new floor that the camera moves, per second
+const HEIGHT_RATIO = 1.5; // largest ratio of the heights of the head and of the panorama's camera over their floors
 const MIN_RATE = 72, LOWEST_RATE = 60; // frames a second: if the device has a choice, and of any device
-const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30; // of the resolution, after so many frames
+const MIN_SCALE = 0.4, SCALE_STEP = 0.85, FRAMES = 30; // least scale of the resolution, factor of a step, and frames before one
 const PLAIN = 0, RING = 1, VIGNETTE = 2, PICTURE = 3; // shapes of shaders/mark.frag
 const BUTTONS = { 4: () => goHome(), 5: () => headset.leave() }; // A and X, B and Y
 
 const rowsOf = (matrix) => [0, 1, 2].map((row) => [0, 1, 2].map((k) => matrix[4 * k + row]));
 const pointOf = ({ x, y, z }) => [x, y, z];
-const unit = (vector) => scaled(vector, 1 / Math.max(Math.hypot(...vector), 1e-9));
 
 class Headset {
   gl = null;
@@ -164,7 +163,7 @@ class Headset {
   }
 
   rotate(vector) {
-    return this.toScene.map((row) => dot(row, vector));
+    return fromAxes(this.toScene, vector);
   }
 
   pointInScene(point) {

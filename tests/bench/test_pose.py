@@ -12,8 +12,8 @@ from pansplat.bench import pose as bench
 from pansplat.cli import run
 from pansplat.errors import InputError
 from pansplat.evaluation.results import Row
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import RelativePose
@@ -68,7 +68,7 @@ def test_the_command_writes_a_row_for_each_pair_and_tour(monkeypatch, tmp_path: 
     assert (pair["suite"], tour["suite"], tour["scene"]) == ("pair", "tour", "room")
     assert pair["outcome"] == "flagged" and "too dark" in pair["note"] and pair["count"] == 2
     assert "0 solved, 1 flagged, 0 wrong" in (out / "pose.md").read_text()
-    known = {view.image: view for view in load_pairs(room)[0].context}
+    known = {view.image: view for view in load_sets(room)[0].context}
     turned = _estimate(list(known.values()), 0.1)
     monkeypatch.setattr(bench, "estimate_poses", lambda images, camera_height: turned)
     assert run(["bench", "pose", str(room), "--threads", "1"]) == 1  # a wrong pose passed the check

@@ -161,7 +161,7 @@ def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
     tmp_path: Path, write_tour: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(export_module, "_MIN_GAUSSIANS", 300_000)
-    first, second = pipeline.load_pairs(write_tour(tmp_path / "house", height=64))
+    first, second = pipeline.load_sets(write_tour(tmp_path / "house", height=64))
     alone = dataclasses.replace(second.context[1], world=1, title="Attic")
     single = dataclasses.replace(second, context=(alone,))
     command = ["export", str(tmp_path / "house"), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
@@ -169,7 +169,7 @@ def test_photographs_without_a_pose_are_in_the_page_of_a_folder(
         ("house", [first, single], "3 panoramas (2 placed, 1 not placed"),
         ("photo", [single], ""),
     ):
-        monkeypatch.setattr(pipeline, "load_pairs", lambda *args, pairs=pairs, **options: pairs)
+        monkeypatch.setattr(pipeline, "load_sets", lambda *args, pairs=pairs, **options: pairs)
         assert run([*command, str(tmp_path / f"{name}.html")]) == 0
         printed = capsys.readouterr().err
         assert note in printed and ("--gaussians 60000 shows more" in printed) == (name == "house")

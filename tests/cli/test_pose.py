@@ -213,10 +213,10 @@ def test_commands_show_the_estimate_of_poses(command: str, folder: Path, tmp_pat
 
 def test_the_written_poses_are_those_that_other_commands_use(linked: Path, estimator) -> None:
     estimator(_place_two)
-    before = {view.name: view for pair in pansplat.load_pairs(linked) for view in pair.context}
+    before = {view.name: view for pair in pansplat.load_sets(linked) for view in pair.context}
     assert run(["pose", str(linked), "-o", str(linked / "poses.json")]) == 0
     estimator(_refuse)
-    after = {view.name: view for pair in pansplat.load_pairs(linked) for view in pair.context}
+    after = {view.name: view for pair in pansplat.load_sets(linked) for view in pair.context}
     assert list(after) == list(before) == ["a", "b", "c"]
     for name, view in after.items():
         assert np.array_equal(view.cam2world, before[name].cam2world)

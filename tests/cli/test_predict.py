@@ -41,7 +41,7 @@ def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, 
         scenes[name] = pipeline.load(tmp_path / f"{name}.ply")
     assert [scene.joint for scene in scenes.values()] == [False, True, True]
     assert len(scenes["once"].gaussians) < 0.9 * len(scenes["layers"].gaussians)
-    (pair,) = pipeline.load_pairs(room)
+    (pair,) = pipeline.load_sets(room)
     views = pair.load_context(64)
 
     def measure_error(name: str) -> float:

@@ -74,7 +74,7 @@ def test_a_video_of_panoramas_begins_with_the_photograph(options, room: Path, tm
     assert run(["render", str(room), "-o", str(out), *arguments]) == 0
     with av.open(str(out)) as video:
         frame = next(video.decode(video=0)).to_ndarray(format="rgb24")
-    (pair,) = pipeline.load_pairs(room)
+    (pair,) = pipeline.load_sets(room)
     pose = fly_pose(torch.stack([view.cam2world for view in pair.context]), 0.0)
     photograph = rotate_equirect(pair.load_context(HEIGHT).images[0], pose[:3, :3])
     likeness = np.corrcoef(frame.mean(axis=2).ravel(), photograph.mean(dim=0).ravel())[0, 1]
@@ -98,7 +98,7 @@ def test_a_video_has_the_size_that_it_is_looked_at(layout, size, scene: Path, tm
 @pytest.fixture
 def parted_scene(room: Path, tmp_path: Path) -> Path:
     """The scene of two panoramas in one part and one in another part, far away."""
-    (pair,) = pipeline.load_pairs(room)
+    (pair,) = pipeline.load_sets(room)
     alone = replace(pair, context=(replace(pair.targets[0], world=1),), targets=())
     (tour,) = find_tours([replace(pair, targets=()), alone])
     pipeline.save(pipeline.predict_tour(tour, "sphere", height=HEIGHT, cache=False), tmp_path / "tour.ply")

@@ -17,7 +17,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.errors import InputError, InputWarning
-from pansplat.inputs.folders import find_panorama_folders, load_pairs, load_panoramas
+from pansplat.inputs.folders import find_panorama_folders, load_panoramas, load_sets
 
 OPTIONS = ["--model", "sphere", "--refine", "0", "--predict-height", "64"]
 
@@ -33,7 +33,7 @@ def test_a_folder_to_train_from_has_the_poses_and_gaussians_of_the_scene_where_t
             row[3] += x
     source.write_text(json.dumps(content))
     assert run(["export", str(room), "-o", str(out), "--training-set", *OPTIONS]) == 0
-    scene = pipeline.predict(pipeline.load_pairs(room)[0], "sphere", height=64, joint=True)
+    scene = pipeline.predict(pipeline.load_sets(room)[0], "sphere", height=64, joint=True)
     assert f"12 cube faces of 2 panoramas, {len(scene.gaussians)} points" in capsys.readouterr().out
     names = ["images", "points.ply", "scale.txt", "sparse", "transforms.json"]
     assert sorted(path.name for path in out.iterdir()) == names
@@ -46,7 +46,7 @@ def test_a_folder_to_train_from_has_the_poses_and_gaussians_of_the_scene_where_t
     table = np.frombuffer(body, [("position", kind, 3), ("color", "u1", 3)])
     x, y, z = points.T
     np.testing.assert_allclose(table["position"], np.stack((x, z, -y), axis=1), rtol=0, atol=2e-3)  # z up
-    (pair,) = pipeline.load_pairs(out)
+    (pair,) = pipeline.load_sets(out)
     for view, pose in zip(pair.context, scene.cam2world, strict=True):
         np.testing.assert_allclose(view.frame.globalize(view.cam2world), scene.frame.globalize(pose), rtol=0, atol=0.01)
 
@@ -61,11 +61,11 @@ def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
         (room / name).unlink()
     recwarn.clear()
     with pytest.raises(InputError, match="needed poses"):  # as of a folder of photographs without poses
-        load_pairs(room)
+        load_sets(room)
     assert [panorama.image for panorama in load_panoramas(room)] == [room / f"{n}.png" for n in "abc"]
     assert find_panorama_folders(tmp_path) == [room]
     for folder in (out, out.parent):
-        images = [view.image for pair in load_pairs(folder) for view in pair.context]
+        images = [view.image for pair in load_sets(folder) for view in pair.context]
         assert images and all(out in image.parents for image in images), "alone, it is a scene"
     shutil.move(out, tmp_path / "set")
     assert find_panorama_folders(tmp_path) == [room]

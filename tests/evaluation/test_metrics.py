@@ -65,10 +65,8 @@ def test_masked_pixels_are_ignored(pair: tuple[torch.Tensor, torch.Tensor]) -> N
     wrong[:, 20:] = 0.0
     mask = torch.ones(32, 64, dtype=torch.bool)
     mask[20:] = False
-    assert psnr(wrong, target, mask=mask) == math.inf
-    assert ws_psnr(wrong, target, mask=mask) == math.inf
-    assert psnr(wrong, target) < 20
-    assert math.isnan(psnr(wrong, target, mask=torch.zeros_like(mask)))
+    assert ws_psnr(wrong, target, mask=mask) == math.inf > 20 > ws_psnr(wrong, target)
+    assert math.isnan(ws_psnr(wrong, target, mask=torch.zeros_like(mask)))
 
 
 def test_ssim_of_constant_images_is_its_closed_form() -> None:
@@ -84,7 +82,7 @@ def test_images_and_masks_that_do_not_fit_are_refused(unchecked: None) -> None:
         with pytest.raises(ValueError, match=r"must both be \(3, height, width\), got \(3, 16, 32\) and \(3, 8, 16\)"):
             metric(image, small)
     with pytest.raises(ValueError, match=r"`mask` must be \(16, 32\)"):
-        psnr(image, image, mask=torch.ones(8, 16, dtype=torch.bool))
+        ws_psnr(image, image, mask=torch.ones(8, 16, dtype=torch.bool))
     with pytest.raises(ValueError, match="larger than 10 x 10"):
         ssim(image[:, :10], image[:, :10])
 
@@ -116,7 +114,7 @@ def test_the_cross_fade_weights_inputs_by_distance() -> None:
         torch.testing.assert_close(faded, torch.full((3, 8, 16), place), atol=1e-5, rtol=0)
 
 
-ROWS = 256
+ROWS = 128
 SPHERE = torch.full((ROWS, 2 * ROWS), 0.5, dtype=torch.float64)  # inverse depth at 2 m
 RAYS = pixel_directions(ROWS, 2 * ROWS, dtype=torch.float64)
 AHEAD = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
@@ -138,7 +136,7 @@ def test_smooth_surfaces_and_planes_are_not_distorted() -> None:
 
 def test_distortion_grows_with_tears_and_is_zero_without_motion() -> None:
     ahead, aside = zip(*(distortion(tear(jump), HALF, AHEAD) for jump in (0, 0.05, 0.2, 0.6)), strict=True)
-    assert list(ahead) == sorted(ahead) and ahead[-1] > 0.1 and list(aside) == sorted(aside) and aside[1] > 0.1
+    assert list(ahead) == sorted(ahead) and ahead[-1] > 0.1 and list(aside) == sorted(aside) and aside[1] > 0.03
     assert all(wide > narrow for wide, narrow in zip(aside[1:], ahead[1:], strict=True))  # parallax is larger there
     assert max(distortion(tear(0.6), 0 * HALF, AHEAD)) < 1e-3
 

@@ -18,7 +18,7 @@ from pansplat.evaluation.pose_check import (
 )
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.pose import invert_pose, rotations_from_quats
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat.inputs.views import Views
 
 _FLIP = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
@@ -150,29 +150,12 @@ def test_implausible_poses_and_unrelated_images_give_a_warning() -> None:
 
 @pytest.mark.slow
 def test_a_single_view_is_refused() -> None:
-    (pair,) = load_pairs(Path(__file__).parents[2] / "assets" / "living_room" / "left.jpg")
+    (pair,) = load_sets(Path(__file__).parents[2] / "assets" / "living_room" / "left.jpg")
     expect_error("left: needed two or more views to check their poses, got one", check_pair, pair)
 
 
 @pytest.mark.shared
 @pytest.mark.parametrize(("data", "index"), [("mp3d_sample", 0), ("zind", 1), ("bsp_demo", 7)])
 def test_shared_poses_pass(shared: Path, data: str, index: int) -> None:
-    check = check_pair(load_pairs(shared / "data" / data)[index])
+    check = check_pair(load_sets(shared / "data" / data)[index])
     assert check.likely_mistake is None
-
-
-@pytest.mark.slow
-@pytest.mark.shared
-@pytest.mark.parametrize(
-    ("convention", "interpretation"),
-    [
-        ("cam2world opengl", "opengl axes"),
-        ("world2cam opencv", "inverse"),
-        ("world2cam opengl", "inverse"),  # with OpenCV axes: both words of the convention are wrong
-    ],
-)
-def test_a_real_pair_with_the_wrong_convention_is_detected(shared: Path, convention: str, interpretation: str) -> None:
-    check = check_pair(load_pairs(shared / "data" / "zind", convention=convention)[3])
-    assert _best(check) == interpretation
-    assert check.likely_mistake is not None
-    assert check.likely_mistake.startswith(_ADVICE[interpretation])

@@ -22,7 +22,7 @@ from pansplat.evaluation.metrics import psnr, ssim, ws_psnr
 from pansplat.evaluation.report import evaluate, results_table
 from pansplat.evaluation.results import Row
 from pansplat.gaussians.scene import Gaussians
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat.training.sequences import BoundedSampler
 
 HEIGHT = 16
@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, write_triplet: Callable[...
 @pytest.fixture(scope="module")
 def case(folder: Path, sphere_predictor: type) -> Row:
     """The triplet's only case, evaluated into `out`."""
-    (case,) = evaluate(load_pairs(folder / "room"), sphere_predictor(), folder / "out", height=HEIGHT)
+    (case,) = evaluate(load_sets(folder / "room"), sphere_predictor(), folder / "out", height=HEIGHT)
     return case
 
 
@@ -82,7 +82,7 @@ def test_metrics_are_those_of_the_written_images(folder: Path, case: Row) -> Non
 def test_an_evaluation_does_not_use_the_prediction_cache(
     tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
-    pairs, predictor = load_pairs(write_triplet(tmp_path / "room")), sphere_predictor()
+    pairs, predictor = load_sets(write_triplet(tmp_path / "room")), sphere_predictor()
     for _ in range(2):
         evaluate(pairs, predictor, tmp_path / "out", height=HEIGHT)
     assert predictor.calls == 4 and not (tmp_path / "room" / ".pansplat").exists()  # each with a warm-up
@@ -91,9 +91,9 @@ def test_an_evaluation_does_not_use_the_prediction_cache(
 def test_cases_of_one_name_have_their_own_folders_and_the_table_has_their_mean(
     tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
-    pairs = [load_pairs(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
+    pairs = [load_sets(write_triplet(tmp_path / place / "room"))[0] for place in ("x", "y")]
     cases = evaluate(pairs, sphere_predictor(), tmp_path / "out", height=HEIGHT)
-    assert [case.get("name") for case in cases] == ["room", "room-2"]
+    assert [case.get("name") for case in cases] == ["room", "room_2"]
     assert len({case.get("prediction") for case in cases}) == 2
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(results_table(cases))
@@ -111,7 +111,7 @@ def test_a_masked_target_has_second_values_of_the_scene_and_of_the_cross_fade(
     mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
     mask[-4:] = 0
     Image.fromarray(mask).save(folder / "c_mask.png")
-    (case,) = evaluate(load_pairs(folder), sphere_predictor(), tmp_path / "out", height=HEIGHT)
+    (case,) = evaluate(load_sets(folder), sphere_predictor(), tmp_path / "out", height=HEIGHT)
     target, prediction = read_image(case.get("target")), read_image(case.get("prediction"))
     faded = sum(read_image(folder / name) for name in ("a.png", "b.png")) / 2
     counts = torch.from_numpy(mask > 0)
@@ -134,18 +134,18 @@ def test_torn_surfaces_are_columns_and_cameras_at_one_place_have_none(
             factor = 1 + 0.4 * torch.sin(5 * (found.means - eyes)).sign().prod(dim=1, keepdim=True)
             return dataclasses.replace(found, means=eyes + factor * (found.means - eyes))
 
-    (torn,) = evaluate(load_pairs(folder / "room"), TornPredictor(), tmp_path / "torn", height=64)
+    (torn,) = evaluate(load_sets(folder / "room"), TornPredictor(), tmp_path / "torn", height=64)
     assert torn.get("distortion_aside") > 0.02 > 1e-3 > case.get("distortion_aside")
     headings = [str(column.header) for column in results_table([torn]).columns]
     assert "torn aside" in headings
-    pairs = load_pairs(write_triplet(tmp_path / "room", baseline=0.0))
+    pairs = load_sets(write_triplet(tmp_path / "room", baseline=0.0))
     (still,) = evaluate(pairs, TornPredictor(), tmp_path / "still", height=64)
     assert still.get("distortion_ahead") is None is still.get("distortion_aside")
     assert "torn aside" not in [str(column.header) for column in results_table([still]).columns]
 
 
 def test_lpips_is_optional(folder: Path, tmp_path: Path, sphere_predictor: type) -> None:
-    pairs, metric = load_pairs(folder / "room"), Lpips("squeeze")
+    pairs, metric = load_sets(folder / "room"), Lpips("squeeze")
     for head in metric.heads:
         head.data.fill_(0.1)
     (case,) = evaluate(pairs, sphere_predictor(), tmp_path / "out", height=32, lpips=metric)
@@ -162,7 +162,7 @@ def test_lpips_is_optional(folder: Path, tmp_path: Path, sphere_predictor: type)
 def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(
     tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
 ) -> None:
-    pairs = load_pairs(write_triplet(tmp_path / "room"))
+    pairs = load_sets(write_triplet(tmp_path / "room"))
     options = {"height": HEIGHT, "blend": "joint"}  # of random images, held-out blocks say nothing
     plain, refined = (
         evaluate(pairs, sphere_predictor(), tmp_path / str(steps), refine_steps=steps, **options)[0]
@@ -184,7 +184,7 @@ def test_the_documented_script_states_the_papers_pairs_of_360loc(tmp_path: Path,
     text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
     script = text.split("```python\n")[1].split("```")[0]
     subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
-    pairs = load_pairs(tmp_path)
+    pairs = load_sets(tmp_path)
     with_targets = [([view.name for view in pair.context], [view.name for view in pair.targets]) for pair in pairs]
     expected = BoundedSampler().evaluation(120)
     assert with_targets == [

@@ -25,12 +25,13 @@ from pansplat.export.doll_house import (
     build_panels,
     make_house,
 )
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.doll_house import Rooms
-from pansplat.tours.graph import DrawnPlace, make_graph
-from pansplat.tours.plan import Door, Plan
+from pansplat.tours.linked_rooms import DrawnPlace
+from pansplat.tours.merge import make_graph
+from pansplat.tours.plan import Door, Plan, Room
 
 FLOOR, CEILING = 1.5, -1.1  # from the cameras, downwards
 BOXES = (box(0, 0, 5, 4), box(5.2, 0, 8, 4))
@@ -49,16 +50,16 @@ def scene() -> Scene:
     """Two rooms: the first one with two cameras."""
     seen = [see_box(*_box_of(view), np.array(place), 20_000) for view, place in enumerate(CAMERAS)]
     gaussians = make_balls(torch.cat(seen), 0.03, views=torch.arange(3).repeat_interleave(20_000))
-    return Scene(gaussians, place_cameras(*CAMERAS), 0.3, 12.0, overlaps=((0, 1, 0.9), (1, 2, 0.3)))
+    return Scene(gaussians, place_cameras(*CAMERAS), 0.3, 12.0, tour=SceneTour(((0, 1, 0.9), (1, 2, 0.3))))
 
 
 @pytest.fixture(scope="module")
 def rooms(scene: Scene) -> Rooms:
     """The known rooms."""
-    plan = Plan(make_graph(scene), (), (DOOR,), FLOOR, None, None, 3, 0)
-    heights = np.full(3, FLOOR), np.full(3, -CEILING)
-    outlines = ((0, 1), BOXES[0]), ((2,), BOXES[1])
-    return Rooms(np.eye(3), np.array(CAMERAS), *heights, outlines, ((0, 1, 2),), plan)
+    outlines = [np.array(box.exterior.coords)[:-1] for box in BOXES]
+    found = (Room("", (0, 1), outlines[0], 0, True), Room("", (2,), outlines[1], 0, True))
+    plan = Plan(make_graph(scene), found, (DOOR,), FLOOR, None, None, 3, 0)
+    return Rooms(np.full(3, FLOOR), np.full(3, -CEILING), ((0, 1, 2),), plan)
 
 
 def _color(places: np.ndarray) -> np.ndarray:
@@ -67,10 +68,10 @@ def _color(places: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def photograph(tmp_path: Path) -> Callable[..., list[Pair]]:
+def photograph(tmp_path: Path) -> Callable[..., list[PanoramaSet]]:
     """A function that writes the photographs; by default of the colours of places, else of one for each camera."""
 
-    def write(*colors: tuple[int, int, int]) -> list[Pair]:
+    def write(*colors: tuple[int, int, int]) -> list[PanoramaSet]:
         pairs = []
         for view, place in enumerate(CAMERAS):
             rays = pixel_directions(256, 512, dtype=torch.float64).numpy()
@@ -83,7 +84,7 @@ def photograph(tmp_path: Path) -> Callable[..., list[Pair]]:
             path = tmp_path / f"{view}.png"
             Image.fromarray(image.round().astype(np.uint8)).save(path)
             panorama = Panorama(f"{view}", path, place_cameras(place)[0])
-            pairs.append(Pair(f"{view}", tmp_path, (panorama,), (), 0.3, 12.0, (path,)))
+            pairs.append(PanoramaSet(f"{view}", tmp_path, (panorama,), (), 0.3, 12.0, (path,)))
         return pairs
 
     return write
@@ -102,7 +103,7 @@ def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(
-    scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
+    scene: Scene, rooms: Rooms, photograph: Callable[..., list[PanoramaSet]]
 ) -> None:
     house = make_house(scene, rooms, photograph())
     places, colors = _sample(house)
@@ -155,7 +156,7 @@ def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(rooms: Room
 
 
 def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
-    scene: Scene, rooms: Rooms, photograph: Callable[..., list[Pair]]
+    scene: Scene, rooms: Rooms, photograph: Callable[..., list[PanoramaSet]]
 ) -> None:
     pairs = photograph((200, 0, 0), (0, 0, 200), (0, 200, 0))
     hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)
@@ -169,13 +170,23 @@ def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
         away = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2)
         floor = (np.abs(y - FLOOR) < 1e-6) & (x < 4.9) & (x > 1.0)
         clear = floor & (np.abs(away[:, 0] - away[:, 1]) > 0.3)
-        tripod = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2).min(axis=1) < np.hypot(FLOOR, 0.6)
+        tripod = np.linalg.norm(places[:, None] - CAMERAS[:2], axis=2).min(axis=1) < np.hypot(FLOOR, 0.7)
         assert (own[clear & ~tripod] == 2 * (away[:, 1] < away[:, 0])[clear & ~tripod]).all()
         for number, camera in enumerate(CAMERAS[:2]):
             below = floor & (np.hypot(x - camera[0], z - camera[2]) < 0.25)
             assert below.sum() > 5 and (own[below] == 2 - 2 * number).all(), "the tripod"
         behind = (x < 1e-6) & (np.abs(z - 2) < 0.6) & (np.abs(y) < 0.5)
         assert behind.sum() > 5 and (own[behind] == expected).all(), "a surface is in front of the wall"
+
+
+def test_what_stands_before_the_floor_below_another_camera_does_not_replace_it(scene: Scene, rooms: Rooms) -> None:
+    wall = see_box(np.array((1.4, -2, 1.0)), np.array((1.5, 2, 3.0)), np.array((1.45, 0, 2)), 4000)
+    hidden = Gaussians.cat([scene.gaussians, make_balls(wall, 0.03, views=0)])
+    floor = next(panel for panel in build_panels(rooms, lambda *_: False) if panel.room == 0 and panel.down[1] == 0)
+    places = (np.array(((3.8, FLOOR, 2.3), (3.0, FLOOR, 2.2))) - floor.corner) @ np.stack((floor.right, floor.down), 1)
+    for shown, expected in ((scene, [True, True]), (dataclasses.replace(scene, gaussians=hidden), [False, True])):
+        cost = _Painter(shown, rooms, ())._judge(floor, places[None], 0, FLOOR)
+        assert np.isfinite(cost[0]).tolist() == expected, "below the second camera, and beside that"
 
 
 def test_what_no_camera_sees_has_the_colours_around_it() -> None:

@@ -13,7 +13,7 @@ from synthetic_scenes import make_balls
 from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.rendering.image_planes import image_planes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.route import STOP_SECONDS
@@ -26,7 +26,7 @@ GAUSSIANS = np.full((48, 64, 3), 0.25, dtype=np.float32)
 
 
 @pytest.fixture
-def photographs(tmp_path: Path) -> list[Pair]:
+def photographs(tmp_path: Path) -> list[PanoramaSet]:
     """Two panoramas whose colours are directions of the world; a mask hides the upper half of the second one."""
     pairs = []
     for index, pose in enumerate(POSES):
@@ -38,7 +38,7 @@ def photographs(tmp_path: Path) -> list[Pair]:
         white[: 64 * index] = 0
         cv2.imwrite(str(mask), white)
         view = Panorama(str(index), image, pose, mask=mask)
-        pairs.append(Pair(str(index), tmp_path, (view,), (), 0.5, 10.0))
+        pairs.append(PanoramaSet(str(index), tmp_path, (view,), (), 0.5, 10.0))
     return pairs
 
 
@@ -55,7 +55,7 @@ def directions(pose: np.ndarray) -> np.ndarray:
     return 0.5 + 0.5 * PLANE.directions().numpy() @ pose[:3, :3].T
 
 
-def test_the_photograph_is_shown_at_its_panorama_and_fades_as_the_camera_leaves(photographs: list[Pair]) -> None:
+def test_the_photograph_is_shown_at_its_panorama_and_fades_as_the_camera_leaves(photographs: list[PanoramaSet]) -> None:
     stops, drawn = FilmPhotographs(photographs, POSES), []
 
     def mix(right: float, seconds: float) -> float:
@@ -77,7 +77,7 @@ def test_the_photograph_is_shown_at_its_panorama_and_fades_as_the_camera_leaves(
     assert mix(0.5, 9.0) == 0
 
 
-def test_a_frame_mixes_the_photographs_of_two_panoramas_without_what_masks_hide(photographs: list[Pair]) -> None:
+def test_a_frame_mixes_the_photographs_of_two_panoramas_without_what_masks_hide(photographs: list[PanoramaSet]) -> None:
     poses = [move(0, 0.0), move(1, 0.0)]
     stops = FilmPhotographs(photographs, POSES)
     frame = [(pose, share, lambda: GAUSSIANS) for pose, share in zip(poses, (0.25, 0.75), strict=True)]
@@ -89,14 +89,14 @@ def test_a_frame_mixes_the_photographs_of_two_panoramas_without_what_masks_hide(
         assert np.abs(image - (0.25 * first + 0.75 * shown))[chosen].max() < 0.01
 
 
-def test_exposures_become_that_of_the_gaussians(photographs: list[Pair]) -> None:
+def test_exposures_become_that_of_the_gaussians(photographs: list[PanoramaSet]) -> None:
     pose = move(0, 0.0)
     stops = FilmPhotographs(photographs, POSES, ((1.25, 1.0, 2.0), (1.0, 1.0, 1.0)))
     image = stops.mix([(pose, 1.0, lambda: GAUSSIANS)], PLANE, 0.0)
     assert np.abs(image - directions(pose) / (1.25, 1.0, 2.0)).max() < 0.01
 
 
-def test_without_photographs_the_frame_is_drawn(photographs: list[Pair]) -> None:
+def test_without_photographs_the_frame_is_drawn(photographs: list[PanoramaSet]) -> None:
     stops = FilmPhotographs((), POSES)
     assert (stops.mix([(move(0, 0.0), 1.0, lambda: GAUSSIANS)], PLANE, 0.0) == GAUSSIANS).all()
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.pose import rotations_from_quats
 
 
@@ -24,10 +24,9 @@ def _make_scene(count: int = 40, degree: int = 1, *, seed: int = 0, spread: floa
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[0, :3, :3] = rotations_from_quats(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
     poses[1, :3, 3] = torch.tensor([1 / 3, -2e-7, 12345.678901234567], dtype=torch.float64)
-    names, gains, overlaps = ("à\n.jpg", "b c.png"), ((1.25, 1.0, 0.9), (0.8, 1.0, 1 / 0.9)), ((0, 0, 1), (1, 1, 0.5))
-    tour = {"overlaps": overlaps, "links": ((1, 0, -3.0, 0.25, "à <b>"),), "starts": (None, (1.0, -0.5))}
-    tour |= {"approximate": ((1, 0, 1.5, -2.0, 0.3),)}
-    return Scene(gaussians, poses, 0.45, 10.0, names, "sweep", height=256, gains=gains, **tour)
+    names, gains, starts = ("à\n.jpg", "b c.png"), ((1.25, 1.0, 0.9), (0.8, 1.0, 1 / 0.9)), (None, (1.0, -0.5))
+    tour = SceneTour(((0, 0, 1), (1, 1, 0.5)), ((1, 0, -3.0, 0.25, "à <b>"),), ((1, 0, 1.5, -2.0, 0.3),))
+    return Scene(gaussians, poses, 0.45, 10.0, names, "sweep", height=256, gains=gains, starts=starts, tour=tour)
 
 
 @pytest.fixture(scope="session")

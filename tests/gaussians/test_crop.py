@@ -9,7 +9,7 @@ from refusals import expect_error
 from synthetic_scenes import make_balls, place_cameras
 
 from pansplat.gaussians.crop import crop, keep_gaussians
-from pansplat.gaussians.scene import Scene
+from pansplat.gaussians.scene import Scene, SceneTour
 
 
 def _make_row(*, joint: bool = False) -> Scene:
@@ -25,7 +25,7 @@ def _make_row(*, joint: bool = False) -> Scene:
     edges = ((0, 1, 0.4), (1, 2, 0.3))
     names = ("a", "b", "c")
     return Scene(
-        gaussians, poses, 0.5, 9.0, names, gains=gains, overlaps=edges, links=links, starts=starts, joint=joint
+        gaussians, poses, 0.5, 9.0, names, gains=gains, starts=starts, tour=SceneTour(edges, links), joint=joint
     )
 
 
@@ -37,8 +37,8 @@ def test_a_crop_keeps_the_cameras_in_the_box_and_numbers_them_anew(order: tuple[
     assert cropped.gaussians.views.tolist() == [0, 0, 0, 1, 1, 1, 1]
     assert cropped.gaussians.views.dtype == torch.uint8
     assert cropped.gains == ((2.0, 2.0, 2.0), (3.0, 3.0, 3.0)) and cropped.starts == ((0.5, 0.0), (1.0, 0.0))
-    assert cropped.overlaps == ((0, 1, 0.3),)
-    assert cropped.links == ((0, 1, 0.2, 0.0, "on"), (1, 0, 0.3, 0.0, "back"))
+    assert cropped.tour and cropped.tour.overlaps == ((0, 1, 0.3),)
+    assert cropped.tour.links == ((0, 1, 0.2, 0.0, "on"), (1, 0, 0.3, 0.0, "back"))
 
 
 def test_a_joint_crop_keeps_what_cameras_outside_have_seen() -> None:
@@ -55,12 +55,12 @@ def test_a_box_without_cameras_keeps_those_that_have_gaussians_in_it() -> None:
 def test_a_panorama_without_neighbours_has_an_edge_to_itself() -> None:
     scene = _make_row()
     part = keep_gaussians(scene, torch.ones(12, dtype=torch.bool), (0, 2))
-    assert part.overlaps == ((0, 0, 1.0), (1, 1, 1.0)) and part.links == ()
+    assert part.tour and part.tour.overlaps == ((0, 0, 1.0), (1, 1, 1.0)) and part.tour.links == ()
 
 
 def test_a_scene_without_cameras_is_cropped(make_scene: Callable[..., Scene]) -> None:
     scene = make_scene()
-    foreign = replace(scene, cam2world=scene.cam2world[:0], names=(), gains=(), overlaps=(), links=(), starts=())
+    foreign = replace(scene, cam2world=scene.cam2world[:0], names=(), gains=(), starts=(), tour=None)
     cropped = crop(foreign, (0, -9, -9, 9, 9, 9))
     assert 0 < len(cropped.gaussians) < 40 and bool((cropped.gaussians.means[:, 0] >= 0).all())
     assert torch.equal(cropped.gaussians.views, scene.gaussians.views[scene.gaussians.means[:, 0] >= 0])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from panorama_formats import EXAMPLES, write_posed, write_room
 from PIL import Image
 from refusals import expect_error
 
@@ -16,15 +17,11 @@ from pansplat import pipeline
 from pansplat.cli.pose import Pose
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.training_set import write_dataset
-from pansplat.geometry.cubemap import face_poses
 from pansplat.images.blur_masks import blur_hidden, find_blur_mask, resize_hidden, widen_hidden
 from pansplat.images.image_files import read_blur_mask, read_panorama, read_thumbnail, write_image
-from pansplat.images.rig_images import Lens
 from pansplat.inputs.content import hash_context, hash_panorama
-from pansplat.inputs.folders import load_pairs, load_panoramas
-from pansplat.inputs.pairs import Pair, Panorama
-from pansplat.inputs.reconstructions.colmap import write_colmap
-from pansplat.inputs.reconstructions.nerfstudio import write_nerfstudio
+from pansplat.inputs.folders import load_panoramas, load_sets
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.poses.files import _hash_inputs
 from pansplat.system.store import hash_parts
 from pansplat.training.sequences import LOCATIONS, read_loc360
@@ -47,18 +44,15 @@ def _write(path: Path, person: int, mask: np.ndarray | None = HIDDEN) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(_make_photograph(person)).save(path)
     if mask is not None:
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name(f"{path.stem}_blur.png"))
+        _draw_mask(path.with_name(f"{path.stem}_blur.png"), mask)
     return path
 
 
 def _write_pair(folder: Path, person: int) -> Path:
-    poses = {}
-    for number, name in enumerate(("left.png", "right.png")):
-        _write(folder / name, person + number)
-        pose = np.eye(4)
-        pose[0, 3] = 0.5 * number
-        poses[name] = {"cam2world": pose.tolist()}
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    pictures = {f"{name}.png": _make_photograph(person + n) for n, name in enumerate(("left", "right"))}
+    write_posed(folder, pictures, (0, 0.5))
+    for name in ("left", "right"):
+        _draw_mask(folder / f"{name}_blur.png")
     return folder
 
 
@@ -125,7 +119,7 @@ def test_every_read_of_a_photograph_is_blurred(tmp_path: Path, suffix: str) -> N
             Image.fromarray(_make_photograph(person)).save(path, quality=90)
         else:
             write_image(path, _make_photograph(person))
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path.with_name("a_blur.png"))
+        _draw_mask(path.with_name("a_blur.png"), mask)
         image, opaque = read_panorama(path, HEIGHT)
         assert opaque.all()
         reads.append((image, read_panorama(path, 32)[0], read_thumbnail(path, 16)))
@@ -143,11 +137,11 @@ def test_black_masks_change_nothing_and_a_mask_of_most_is_noted(tmp_path: Path) 
 def test_cube_faces_of_a_panorama_are_blurred(tmp_path: Path, color_face: Callable[[str, int], np.ndarray]) -> None:
     for face in "frblud":
         Image.fromarray(color_face(face, 32)).save(tmp_path / f"hall_{face}.png")
-    (pair,) = load_pairs(tmp_path)
+    (pair,) = load_sets(tmp_path)
     plain = pair.load_context(HEIGHT)
     assert pair.context[0].name == "hall" and find_blur_mask(pair.context[0].image) is None
-    Image.fromarray(np.where(HIDDEN, 255, 0).astype(np.uint8)).save(tmp_path / "hall_blur.png")
-    (pair,) = load_pairs(tmp_path)
+    _draw_mask(tmp_path / "hall_blur.png")
+    (pair,) = load_sets(tmp_path)
     assert find_blur_mask(pair.context[0].image) == tmp_path / "hall_blur.png"
     views = pair.load_context(HEIGHT)
     hidden = torch.from_numpy(WIDE)
@@ -159,13 +153,13 @@ def test_damaged_and_white_masks_are_refused(tmp_path: Path) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     mask = folder / "left_blur.png"
     Image.new("L", (128, 64), 255).save(mask)
-    expect_error(r"left_blur\.png: .*white only", lambda: load_pairs(folder)[0].load_context(HEIGHT))
+    expect_error(r"left_blur\.png: .*white only", lambda: load_sets(folder)[0].load_context(HEIGHT))
     Image.new("L", (64, 64)).save(mask)
     for path in (folder, folder / "left.png"):
-        expect_error(r"left_blur\.png: .*128x64, got 64x64", load_pairs, path)
+        expect_error(r"left_blur\.png: .*128x64, got 64x64", load_sets, path)
     _draw_mask(mask)
     mask.write_bytes(mask.read_bytes()[:60])
-    for read in (lambda: load_pairs(folder), lambda: read_panorama(folder / "left.png", HEIGHT)):
+    for read in (lambda: load_sets(folder), lambda: read_panorama(folder / "left.png", HEIGHT)):
         expect_error(r"left_blur\.png: .*damaged", read)
 
 
@@ -186,9 +180,9 @@ def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool)
     if not is_posed:
         (folder / "poses.json").unlink()
     mask = _draw_mask(folder / name, kind="blur" if "blur" in name.lower() else "mask")
-    panoramas = load_pairs(folder)[0].context if is_posed else load_panoramas(folder)
+    panoramas = load_sets(folder)[0].context if is_posed else load_panoramas(folder)
     assert [view.name for view in panoramas] == ["left", "right"]
-    for view in (panoramas[0], load_pairs(folder / "left.png")[0].context[0]):
+    for view in (panoramas[0], load_sets(folder / "left.png")[0].context[0]):
         assert mask in (view.mask, find_blur_mask(view.image))
 
 
@@ -196,7 +190,7 @@ def test_a_mask_is_a_mask_in_any_case(tmp_path: Path, name: str, is_posed: bool)
 def test_the_mask_of_a_folder_is_one_in_any_case(tmp_path: Path, name: str) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     _draw_mask(folder / name, kind="mask")
-    assert torch.equal(load_pairs(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN))
+    assert torch.equal(load_sets(folder)[0].load_context(HEIGHT).masks[0], torch.from_numpy(~HIDDEN))
 
 
 @pytest.mark.parametrize(
@@ -219,12 +213,12 @@ def test_a_mask_that_is_not_applied_is_refused(tmp_path: Path, name: str, right:
     for path in (folder, *([folder / "left.png"] if name == "left_blur.jpg" else [])):
         with warnings.catch_warnings(), pytest.raises(InputError, match=rf"{name}: needed the name.*{right}"):
             warnings.filterwarnings("ignore", message=r".*has no pose of left_blur\.jpg")
-            load_pairs(path)
+            load_sets(path)
 
 
 def test_two_masks_of_a_panorama_are_refused(tmp_path: Path) -> None:
     _draw_mask(_write_pair(tmp_path / "pair", 1) / "left_Blur.png")
-    expect_error(r"left\.png: .*left_Blur\.png, left_blur\.png", load_pairs, tmp_path / "pair")
+    expect_error(r"left\.png: .*left_Blur\.png, left_blur\.png", load_sets, tmp_path / "pair")
 
 
 def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
@@ -234,14 +228,14 @@ def test_masks_that_poses_state_have_any_name(tmp_path: Path) -> None:
         _draw_mask(folder / name, kind="mask")
         content["poses"][("left.png", "right.png")[number]]["mask"] = name
     (folder / "poses.json").write_text(json.dumps(content))
-    assert not load_pairs(folder)[0].load_context(HEIGHT).masks.all()
+    assert not load_sets(folder)[0].load_context(HEIGHT).masks.all()
 
 
 def test_a_scene_file_is_no_mask(tmp_path: Path) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
     for name in ("blur.ply", "mask.compressed.ply", "left_blur.spz"):
         (folder / name).write_bytes(b"")
-    assert len(load_pairs(folder)) == 1
+    assert len(load_sets(folder)) == 1
 
 
 @pytest.mark.parametrize("source", ["file", "poses.json", "pose folder"])
@@ -252,7 +246,7 @@ def test_a_mask_is_never_a_panorama(tmp_path: Path, source: str) -> None:
         content = json.loads((folder / "poses.json").read_text())
         content["poses"][mask.name] = content["poses"]["left.png"]
         (folder / "poses.json").write_text(json.dumps(content))
-    read = Pose(folder).run if source == "pose folder" else lambda: load_pairs(mask if source == "file" else folder)
+    read = Pose(folder).run if source == "pose folder" else lambda: load_sets(mask if source == "file" else folder)
     expect_error(f"{mask.name}: needed", read)
 
 
@@ -266,134 +260,68 @@ def test_a_mask_of_no_frame_of_360loc_is_refused(tmp_path: Path) -> None:
     expect_error(r"frame_1_blur\.png: .*frame_0_blur", read_loc360, tmp_path, "val")
 
 
-SIDE = 48  # pixels along a face
-COVER = np.zeros((SIDE, SIDE), bool)  # what a mask of the front face covers
-COVER[16:36, 14:34] = True
-FRONT = np.zeros((HEIGHT, 2 * HEIGHT), bool)  # the front face, and more
-FRONT[10:54, 44:84] = True
-FACES = {"f": "front", "r": "right", "b": "back", "l": "left", "u": "up", "d": "down"}
-
-
-def _write_faces(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    """Six faces of hall; another person for each number is on the front face, where `COVER` is white."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for face in FACES:
-        pixels = color_face(face, SIDE)
-        if face == "f":
-            pixels[COVER] = np.random.default_rng(person).integers(0, 255, (int(COVER.sum()), 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"hall_{face}.png")
-    return folder
-
-
-def _write_set(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    """The faces with poses, as COLMAP and nerfstudio have them, in two places."""
-    (folder / "images").mkdir(parents=True)
-    lens = Lens(SIDE / 2, SIDE / 2, SIDE / 2, SIDE / 2, SIDE, SIDE)
-    rigs = []
-    for place in (0, 1):
-        _write_faces(folder / "faces", color_face, person if place == 0 else 0)
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[0, 3] = place
-        rig = []
-        for face, turned in zip(FACES, face_poses(pose), strict=True):
-            name = f"000{place}_a_{FACES[face]}.png"
-            (folder / "faces" / f"hall_{face}.png").rename(folder / "images" / name)
-            rig.append((name, turned, lens))
-        rigs.append(rig)
-    (folder / "faces").rmdir()
-    (folder / "sparse" / "0").mkdir(parents=True)
-    write_colmap(folder / "sparse" / "0", rigs, np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    shots = [(f"images/{name}", pose, shot_lens, None) for rig in rigs for name, pose, shot_lens in rig]
-    write_nerfstudio(folder / "transforms.json", shots, None)
+def _write_example(folder: Path, name: str) -> Path:
+    """Two panoramas, hall and room, of cube faces or of perspective pictures of 8 x 8 pixels."""
+    EXAMPLES[name].state(write_room(folder, NAMES), NAMES)
     (folder / "scale.txt").write_text("1\n")
     return folder
 
 
-def _write_colmap(folder: Path, color_face: Callable[[str, int], np.ndarray], person: int) -> Path:
-    (_write_set(folder, color_face, person) / "transforms.json").unlink()
-    return folder
+NAMES = "hall.png", "room.png"
+COVER = np.ones((8, 8), bool)  # what a mask of a picture covers
 
 
-ASSEMBLED = {
-    "faces": (_write_faces, "hall_f_blur.png"),
-    "nerfstudio": (_write_set, "images/0000_a_front_blur.png"),
-    "colmap": (_write_colmap, "images/0000_A_front_BLUR.png"),
-}
-
-
-def _load_first(folder: Path) -> Panorama:
-    return load_pairs(folder)[0].context[0]
-
-
-@pytest.mark.parametrize("kind", ASSEMBLED)
+@pytest.mark.parametrize(("kind", "name"), [("cube faces", "hall_f_blur.png"), ("rigs", "faces/Hall_0_BLUR.png")])
 def test_a_blur_mask_of_a_picture_is_refused_and_the_mask_of_its_panorama_is_named(
-    tmp_path: Path, kind: str, color_face: Callable[[str, int], np.ndarray]
+    tmp_path: Path, kind: str, name: str
 ) -> None:
-    write, name = ASSEMBLED[kind]
-    folder = write(tmp_path / "set", color_face, 1)
+    folder = _write_example(tmp_path / "set", kind)
     mask = _draw_mask(folder / name, COVER)
-    expect_error(rf"{mask.name}: needed .*(hall|0000_a)_blur", load_pairs, folder)
+    expect_error(rf"{mask.name}: .*[/ ]hall_blur", load_panoramas, folder)
     mask.unlink()
-    _draw_mask(folder / f"{load_panoramas(folder)[0].name}_blur.png")
-    assert find_blur_mask(_load_first(folder).image)
+    _draw_mask(folder / "hall_Blur.PNG")
+    _draw_mask(folder / "hall_mask.png", kind="mask")
+    panorama = load_panoramas(folder)[0]
+    assert find_blur_mask(panorama.image) == folder / "hall_Blur.PNG" and panorama.mask == folder / "hall_mask.png"
 
 
 @pytest.mark.filterwarnings("ignore:.*in no picture")
-def test_a_scene_mask_beside_a_perspective_picture_masks_it_and_that_of_a_cube_face_is_refused(
-    tmp_path: Path, color_face: Callable[[str, int], np.ndarray]
-) -> None:
-    folder = _write_set(tmp_path / "set", color_face, 1)
-    _draw_mask(folder / "images" / "0000_a_Front_mask.png", COVER, kind="mask")
-    masks = load_pairs(folder)[0].load_context(64).masks
-    assert not masks[0, 34, 64] and masks[0, :, :32].all() and masks[1].all()
-    folder = _write_faces(tmp_path / "faces", color_face, 1)
+@pytest.mark.parametrize(
+    "name", ["faces/Hall_0_mask.png", "masks/faces/hall_0.png.png", "masks/Hall_0.PNG.png", "masks/hall_0.png"]
+)
+def test_a_scene_mask_of_a_perspective_picture_masks_it(tmp_path: Path, name: str) -> None:
+    folder = _write_example(tmp_path / "set", "rigs")
+    _draw_mask(folder / name, COVER, kind="mask")
+    masks = load_sets(folder)[0].load_context(64).masks
+    assert not masks[0, 32, 64] and masks[0, :, :32].all() and masks[1].all(), "the first picture is ahead"
+
+
+def test_a_scene_mask_of_a_cube_face_is_refused(tmp_path: Path) -> None:
+    folder = _write_example(tmp_path / "faces", "cube faces")
     _draw_mask(folder / "hall_f_mask.png", COVER, kind="mask")
-    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_pairs, folder)
+    expect_error(r"hall_f_mask\.png: .*hall_mask\.png", load_panoramas, folder)
 
 
 @pytest.mark.parametrize(
     ("kind", "name", "got"),
     [
-        ("faces", "hall_blur.png", "192x96, got 48x48"),
-        ("colmap", "images/0000_a_blur.png", "set/0000_a_blur"),
-        ("nerfstudio", "images/0000_a_frond_blur.png", "/0000_a_blur"),
-        ("colmap", "masks/0000_a_frond.png.png", "the name of a picture"),
-        ("nerfstudio", "masks/0000_a_front_blur.png", "the name"),
+        ("cube faces", "hall_blur.png", "32x16, got 8x8"),
+        ("rigs", "faces/hall_blur.png", "set/hall_blur"),
+        ("rigs", "masks/hall_9.png.png", "the name of a picture"),
+        ("rigs", "masks/hall_0_blur.png", "the name"),
     ],
 )
-def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(
-    tmp_path: Path, kind: str, name: str, got: str, color_face: Callable
-) -> None:
-    mask = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1) / name
-    mask.parent.mkdir(exist_ok=True)
-    Image.new("L", (48, 48)).save(mask)
-    expect_error(f"{mask.name}: needed.*{got}", load_pairs, tmp_path / "set")
+def test_a_mask_that_no_panorama_of_pictures_applies_is_refused(tmp_path: Path, kind: str, name: str, got: str) -> None:
+    mask = _draw_mask(_write_example(tmp_path / "set", kind) / name, COVER)
+    expect_error(f"{mask.name}: needed.*{got}", load_panoramas, tmp_path / "set")
 
 
-@pytest.mark.parametrize("name", ["0000_a_front.png.png", "0000_A_front.PNG.png", "0000_a_front.png"])
-@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
-def test_the_folder_masks_is_applied(tmp_path: Path, kind: str, name: str, color_face: Callable) -> None:
-    folder = ASSEMBLED[kind][0](tmp_path / "set", color_face, 1)
-    _draw_mask(folder / "masks" / name, COVER, kind="mask")
-    with pytest.warns(InputWarning, match="in no picture"):
-        assert not load_pairs(folder)[0].load_context(64).masks[0, 34, 64]
-
-
-def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path, color_face: Callable) -> None:
-    file = _write_set(tmp_path / "set", color_face, 1) / "transforms.json"
+def test_a_stated_mask_that_is_missing_is_refused(tmp_path: Path) -> None:
+    file = _write_example(tmp_path / "set", "rigs") / "transforms.json"
     content = json.loads(file.read_text())
     content["frames"][3]["mask_path"] = "masks/a.png"
     file.write_text(json.dumps(content))
-    expect_error(r"frame 3: .*masks/a\.png", load_pairs, file.parent)
-
-
-def test_a_mask_beside_a_rig_is_that_of_its_panorama(tmp_path: Path, color_face: Callable) -> None:
-    folder = _write_set(tmp_path / "set", color_face, 1)
-    _draw_mask(folder / "0000_a_mask.png", kind="mask")
-    _draw_mask(folder / "0001_A_Blur.PNG")
-    panoramas = load_pairs(folder)[0].context
-    assert panoramas[0].mask == folder / "0000_a_mask.png" and panoramas[1].mask is None
-    assert find_blur_mask(panoramas[1].image) == folder / "0001_A_Blur.PNG"
+    expect_error(r"frame 3: .*masks/a\.png", load_panoramas, file.parent)
 
 
 def _link(path: Path, target: Path) -> None:
@@ -408,9 +336,9 @@ def test_masks_beside_a_link_are_applied_and_those_beside_its_file_are_refused(t
     (tmp_path / "store").mkdir()
     moved = (folder / "left.png").rename(tmp_path / "store" / "left.png")
     _link(folder / "left.png", moved)
-    assert find_blur_mask(_load_first(folder).image) == folder / "left_blur.png"
+    assert find_blur_mask(load_panoramas(folder)[0].image) == folder / "left_blur.png"
     (folder / "left_blur.png").rename(tmp_path / "store" / "left_blur.png")
-    expect_error(r"store/left_blur\.png: needed", load_pairs, folder)
+    expect_error(r"store/left_blur\.png: needed", load_sets, folder)
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
@@ -419,45 +347,34 @@ def test_a_name_has_its_mask_in_both_forms_of_unicode(tmp_path: Path, forms: tup
     picture, name = (unicodedata.normalize(form, "K\u00fcche") for form in forms)  # type: ignore[arg-type]
     _write(tmp_path / f"{picture}.png", 1, None)
     mask = _draw_mask(tmp_path / f"{name}_blur.png")
-    found = find_blur_mask(_load_first(tmp_path).image)
+    found = find_blur_mask(load_panoramas(tmp_path)[0].image)
     assert found is not None and found.samefile(mask)
 
 
-@pytest.mark.parametrize(("kind", "name"), [("panoramas", "left_blur.png"), ("set", "0000_a_blur.png")])
 def test_scenes_training_sets_and_caches_depend_on_what_masks_leave(
-    tmp_path: Path, kind: str, name: str, color_face: Callable, sphere_predictor: Callable[[], object]
+    tmp_path: Path, sphere_predictor: Callable[[], object]
 ) -> None:
-    def list_keys(pair: Pair) -> tuple[str, ...]:
+    def list_keys(pair: PanoramaSet) -> tuple[str, ...]:
         """Those of predictions, of estimated poses, and of pages."""
         return hash_context(pair), _hash_inputs(pair.context, 1.5), hash_parts(*map(hash_panorama, pair.context))
 
-    scenes, sets, predictor = [], [], sphere_predictor()
+    scenes, sets, predictor, nothing = [], [], sphere_predictor(), np.zeros((1, 3))
     for person in (1, 5):
-        folder = tmp_path / f"{person}"
-        if kind == "set":
-            mask = _draw_mask(_write_set(folder, color_face, person) / name, FRONT)
-        else:
-            mask = _write_pair(folder, person) / name
-        before = mask.rename(tmp_path / "mask.png")
-        keys = []
+        folder, new = tmp_path / f"{person}", tmp_path / f"new{person}"
+        mask = _write_pair(folder, person) / "left_blur.png"
+        before, keys = mask.rename(tmp_path / "mask.png"), []
         for _ in range(2):
-            (pair,) = load_pairs(folder)
+            (pair,) = load_sets(folder)
             scenes.append(pipeline.predict(pair, predictor, height=HEIGHT).gaussians)  # type: ignore[arg-type]
-            keys.append((*list_keys(pair), predictor.calls))  # type: ignore[attr-defined]
+            keys.append(list_keys(pair))
             if not mask.exists():
                 before.rename(mask)
-        pipeline.predict(pair, predictor, height=HEIGHT)  # type: ignore[arg-type]
-        assert predictor.calls == keys[-1][-1], "read from the cache"  # type: ignore[attr-defined]
-        stated = mask.read_bytes()
-        _draw_mask(mask, np.roll(FRONT if kind == "set" else HIDDEN, 4, axis=0))
-        keys.append((*list_keys(pair), -1))
-        assert all(len(set(values)) == 3 for values in zip(*keys, strict=True)), "without, with, and with another mask"
-        mask.write_bytes(stated)
-        new = tmp_path / f"new{person}"
         new.mkdir()
-        nothing = np.zeros((1, 3))
         write_dataset(new, pair.context, pair.siblings, nothing, nothing.astype(np.uint8))
         sets.append({file.name: file.read_bytes() for file in new.rglob("*.*")})
+        _draw_mask(mask, np.roll(HIDDEN, 4, axis=0))
+        keys.append(list_keys(pair))
+        assert all(len(set(values)) == 3 for values in zip(*keys, strict=True)), "without, with, and with another mask"
     plain, first, _, second = scenes
     assert torch.equal(first.harmonics, second.harmonics) and torch.equal(first.means, second.means)
     assert not torch.equal(plain.harmonics, first.harmonics)
@@ -470,6 +387,6 @@ def test_a_web_tour_names_the_picture_of_its_masks(tmp_path: Path) -> None:
     tour = {"scenes": {"kitchen": {"type": "equirectangular", "panorama": "panos/IMG_1.png"}}}
     (tmp_path / "tour.json").write_text(json.dumps(tour))
     _draw_mask(tmp_path / "kitchen_blur.png")
-    expect_error(r"kitchen_blur\.png: .*IMG_1_blur\.png", load_pairs, tmp_path)
+    expect_error(r"kitchen_blur\.png: .*IMG_1_blur\.png", load_sets, tmp_path)
     (tmp_path / "kitchen_blur.png").rename(tmp_path / "panos" / "IMG_1_Blur.PNG")
-    assert find_blur_mask(_load_first(tmp_path).image) == tmp_path / "panos" / "IMG_1_Blur.PNG"
+    assert find_blur_mask(load_panoramas(tmp_path)[0].image) == tmp_path / "panos" / "IMG_1_Blur.PNG"

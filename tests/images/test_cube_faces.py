@@ -32,11 +32,6 @@ def test_six_files_of_one_name_are_a_cube(tmp_path: Path, prefix: str, endings, 
     check_colors(read_panorama(write_cube(*cubes.values(), tmp_path, "cube"), 48)[0])
 
 
-def test_a_missing_face_leaves_the_pictures_alone(tmp_path: Path) -> None:
-    files = [tmp_path / f"hall_{face}.png" for face in "frblu"]
-    assert group_faces(files) == ({}, files)
-
-
 def test_panoramas_with_names_of_faces_are_no_cube(tmp_path: Path, write_scene) -> None:
     files = [tmp_path / f"{name}.png" for name in NAMES["words"]]
     for file in files:

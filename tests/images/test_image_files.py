@@ -134,7 +134,7 @@ def test_the_size_of_an_image_is_read_without_its_pixels(tmp_path: Path, monkeyp
     turned[0x0112] = 6
     Image.new("RGB", (30, 20)).save(tmp_path / "turned.jpg", exif=turned)
     monkeypatch.setattr("PIL.ImageFile.ImageFile.load", None)
-    monkeypatch.setattr("pansplat.images.image_files._exr_channels", None)
+    monkeypatch.setattr("pansplat.images.image_files._decode_exr", None)
     assert [read_size(tmp_path / f"a{suffix}") for suffix in (".png", ".jpg", ".webp", ".exr")] == [(30, 20)] * 4
     assert read_size(tmp_path / "turned.jpg") == (20, 30)
 

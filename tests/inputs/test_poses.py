@@ -82,8 +82,8 @@ def _changed(**entries: float) -> list:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (None, "needed a pose, got none"),
-        ([[1.0, 0.0], [0.0, 1.0]], r"got shape \(2, 2\)"),
+        (None, "none"),
+        ([[1.0, 0.0], [0.0, 1.0]], r"\(2, 2\)"),
         (_changed(m00=math.nan), "NaN or infinite"),
         (_changed(m03=math.inf), "NaN or infinite"),
         (_changed(m00=3.0), "no rotation"),

@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +10,6 @@ import pytest
 import safetensors.torch
 import torch
 from refusals import expect_error
-from torch import Tensor
 
 from pansplat.errors import InputError
 from pansplat.networks.weights import (
@@ -24,8 +22,6 @@ from pansplat.networks.weights import (
     require_shapes,
     save_weights,
 )
-
-Wrap = Callable[[dict[str, Tensor]], dict[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 
 import pansplat
 from pansplat.errors import InputError
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.inputs.placements import ApproximatePlace
 from pansplat.poses.approximate import LinkedPlace
 from pansplat.poses.edit import PoseEditor
@@ -50,7 +50,7 @@ def folder(tmp_path: Path, monkeypatch) -> Path:
 
 
 def _load(folder: Path) -> dict[str, Panorama]:
-    pairs = pansplat.load_pairs(folder)
+    pairs = pansplat.load_sets(folder)
     return {view.name: view for pair in pairs for view in pair.context}
 
 
@@ -133,7 +133,7 @@ def test_saving_keeps_other_entries_fields_and_the_convention(folder: Path):
 
 def test_poses_that_were_read_in_another_convention_are_not_changed(folder: Path):
     write_poses(_estimate(sorted(folder.glob("*.png"))), folder / "poses.json")
-    views = [view for pair in pansplat.load_pairs(folder, convention="cam2world opengl") for view in pair.context]
+    views = [view for pair in pansplat.load_sets(folder, convention="cam2world opengl") for view in pair.context]
     with pytest.raises(InputError, match="needed poses in the convention of the file"):
         PoseEditor(folder, views)
 
@@ -227,7 +227,7 @@ def test_all_groups_of_an_estimate_are_written(folder: Path):
     groups = tuple(PoseGroup(own, 0.3 + n, 8.0 + n, 0.0, "a test") for n, own in enumerate(poses))
     write_poses(PoseEstimate(tuple(images), groups, {}, {}), folder / "poses.json")
     assert _states(folder) == dict.fromkeys("abcd", "placed") | dict.fromkeys("ef", "not placed")
-    pairs = pansplat.load_pairs(folder)
+    pairs = pansplat.load_sets(folder)
     assert [[view.world for view in pair.context] for pair in pairs[:2]] == [[0, 0], [1, 1]]
     assert [(pair.near, pair.far) for pair in pairs[:2]] == [(0.3, 8), (1.3, 9)]
 
@@ -276,7 +276,7 @@ def test_what_a_user_adds_to_estimated_poses_stays_and_the_poses_are_estimated_a
     assert content["poses"]["b.png"]["note"] == 3
     assert (content["worlds"][0]["unit"], content["worlds"][0]["note"]) == (3.2, 7)
     assert (folder / "poses.json.bak").read_bytes() == before
-    pair = pansplat.load_pairs(folder)[0]
+    pair = pansplat.load_sets(folder)[0]
     assert (pair.near, pair.far) == (0.2, 5)
 
 
@@ -285,7 +285,7 @@ def test_near_and_far_of_a_world_that_a_user_states_stay(folder: Path):
     _write_edited(folder, lambda content: content["worlds"][0].update(near=0.2, far=5))
     for overwrite in (False, True):
         write_poses(_scaled(2, images), folder / "poses.json", overwrite=overwrite)
-        assert [(pair.near, pair.far) for pair in pansplat.load_pairs(folder)][:1] == [(0.2, 5)]
+        assert [(pair.near, pair.far) for pair in pansplat.load_sets(folder)][:1] == [(0.2, 5)]
     assert _load(folder)["e"].cam2world[0, 3] == 8
 
 

@@ -77,7 +77,7 @@ def test_the_sample_has_its_poses(estimate: PoseEstimate) -> None:
 def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, tmp_path: Path) -> None:
     shutil.copytree(photographs, tmp_path / "photographs")
     write_poses(estimate, photographs / "poses.json")
-    (pair,) = pansplat.load_pairs(photographs)
+    (pair,) = pansplat.load_sets(photographs)
     (photographs / "poses.json").unlink()
     for panorama in pair.context:
         assert np.allclose(panorama.cam2world.numpy(), estimate.poses[panorama.image], atol=1e-8)
@@ -92,12 +92,12 @@ def test_a_folder_without_poses_is_loaded_with_estimated_ones(
     monkeypatch.setattr("pansplat.poses.files.estimate_poses", lambda images, **options: estimate)
     message = "has no poses; they were estimated: 2 of 2 panoramas"
     with pytest.warns(UserWarning, match=message):
-        (pair,) = pansplat.load_pairs(photographs)
+        (pair,) = pansplat.load_sets(photographs)
     assert sorted(panorama.name for panorama in pair.context) == ["left", "right"]
     assert not (photographs / "poses.json").exists()
     monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
     with pytest.warns(UserWarning, match=message):
-        (again,) = pansplat.load_pairs(photographs)
+        (again,) = pansplat.load_sets(photographs)
     assert all((a.cam2world == b.cam2world).all() for a, b in zip(pair.context, again.context, strict=True))
 
 

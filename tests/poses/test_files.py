@@ -39,7 +39,7 @@ def _place(*groups: tuple[str, ...]):
 
 
 def _load(folder: Path) -> list:
-    return pansplat.load_pairs(folder)
+    return pansplat.load_sets(folder)
 
 
 def test_the_panoramas_that_are_not_placed_are_scenes_of_their_own(tmp_path: Path, monkeypatch) -> None:
@@ -196,7 +196,7 @@ def test_the_panoramas_of_a_web_tour_keep_titles_links_and_start_views(tmp_path:
             pytest.warns(UserWarning, match=r"a test\. `pansplat pose .*poses\.json` writes them to a file\.$"),
             pytest.warns(UserWarning, match=r"b\.png \(Attic\) has no pose"),
         ):
-            pair, attic = pansplat.load_pairs(path)
+            pair, attic = pansplat.load_sets(path)
         hall, bath = pair.context
         assert [(view.name, view.label, view.world) for view in (hall, bath)] == [
             ("hall", "Hall", 0),

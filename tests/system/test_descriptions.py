@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pansplat.gaussians.scene import Gaussians, Scene, empty_gaussians
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.inputs.placements import Placement
 from pansplat.inputs.views import Views
 from pansplat.model.network import NetworkPredictor
@@ -31,7 +31,7 @@ RIGHT = Panorama("right", Path("right.jpg"), POSES[0], title="Hall", placement=P
 GROUP = PoseGroup({Path(f"{name}.jpg"): np.eye(4) for name in "ab"}, 0.4, 8.0, 0.25, "the camera's height")
 SCENE = Scene(GAUSSIANS, POSES, 0.45, 10.0, ("left", "right"), "default", 256)
 VIEWS = Views(torch.zeros(2, 3, 8, 16), POSES, MASKS, 0.45, 10.0, ("left", "right"))
-PAIR = Pair("room", Path("folder"), (LEFT, RIGHT), (LEFT,), 0.45, 10.0)
+PAIR = PanoramaSet("room", Path("folder"), (LEFT, RIGHT), (LEFT,), 0.45, 10.0)
 TOUR = TourGraph("home", Path(), (LEFT, RIGHT), 0.45, 10.0, overlaps={(0, 0): 1.0, (1, 1): 1.0})
 ESTIMATE = PoseEstimate(tuple(Path(f"{n}.jpg") for n in "abc"), (GROUP,), {Path("c.jpg"): "dark"}, {})
 

@@ -89,7 +89,7 @@ def test_a_change_of_an_imported_module_invalidates_a_kernel(decorate, monkeypat
     """`lift` inlines functions of `surface`; numba itself checks the file of the kernel only."""
     stamps = []
     monkeypatch.setattr(source_hash, "_FOLDER", tmp_path)
-    monkeypatch.setattr(kernels, "set_source_stamp", lambda compiled, stamp: not stamps.append(stamp))
+    monkeypatch.setattr(kernels, "set_source_stamp", lambda compiled, stamp: stamps.append(stamp))
     (tmp_path / "sweep").mkdir()
     (tmp_path / "sweep/lift.py").write_text("from pansplat.sweep.surface import locate\n")
     function = type(_add_indices)(_add_indices.__code__, {"range": range})

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pansplat.inputs.pairs import Link, Pair, Panorama
+from pansplat.inputs.panorama_sets import Link, Panorama, PanoramaSet
 from pansplat.tours.graph import TourGraph, find_tours
 
 
@@ -52,5 +52,5 @@ def home(make_tour) -> TourGraph:
     siblings = tuple(panorama.image for panorama in panoramas)
     groups = ((0, 1), (1, 2), (3,), (4, 5), (6,))
     contexts = [tuple(panoramas[node] for node in group) for group in groups]
-    (tour,) = find_tours([Pair("", Path("home"), context, (), 0.45, 10.0, siblings) for context in contexts])
+    (tour,) = find_tours([PanoramaSet("", Path("home"), context, (), 0.45, 10.0, siblings) for context in contexts])
     return tour

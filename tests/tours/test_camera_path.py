@@ -1,16 +1,16 @@
 """Camera paths pass their key frames smoothly, and their files are read strictly."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
 from pansplat.errors import InputError
 from pansplat.geometry.path import turn_axes
 from pansplat.geometry.world import WorldFrame
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.camera_path import CameraPath, KeyFrame, read_path, write_path
 from pansplat.tours.graph import TourGraph
 
@@ -47,7 +47,7 @@ def test_a_path_turns_the_short_way():
 def test_key_frames_are_level_in_the_axes_of_the_scene():
     level, pose = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))), np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn_axes(level, 0.7, -0.3), (1, 2, 3)
-    path = CameraPath().add(KeyFrame.of_pose(pose, 0.0, 50.0))
+    path = CameraPath().add(KeyFrame(0.0, tuple(pose[:3, 3]), tuple(pose[:3, 2]), 50.0))
     again, fov = path.interpolate(0.0, level)
     assert np.allclose(again, pose) and fov == 50.0
 
@@ -75,7 +75,7 @@ def test_a_path_in_the_world_of_a_scene_and_back_is_the_same():
     assert local.key_frames[0].position == pytest.approx((np.array(PATH.key_frames[0].position) - frame.origin) / 1e3)
     for frame_again, given in zip(local.map_places(frame.globalize_places).key_frames, PATH.key_frames, strict=True):
         assert frame_again.position == pytest.approx(given.position, abs=1e-5)
-        assert replace(frame_again, position=given.position) == given
+        assert structs.replace(frame_again, position=given.position) == given
 
 
 FRAME = '{"seconds": 0, "position": [0, 0, 0], "direction": [0, 0, 1]}'

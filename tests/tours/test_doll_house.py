@@ -4,14 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
-from pansplat.gaussians.scene import Scene
-from pansplat.tours import plan as plan_module
+from pansplat.gaussians.scene import Scene, SceneTour
 from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
+from pansplat.tours.plan import _enclose
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around a camera: x, y down, z
 PLACES = ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (10.0, 0.0, 0.0))
@@ -23,7 +24,7 @@ def rooms() -> Scene:
     seen = [see_box(LOW + place, HIGH + place, np.array(place), 20_000) for place in PLACES]
     views = torch.arange(3).repeat_interleave(20_000)
     gaussians = make_balls(torch.cat(seen), 0.02, views=views)
-    return Scene(gaussians, place_cameras(*PLACES), 0.3, 12.0, overlaps=((0, 1, 0.5), (1, 2, 0.5)))
+    return Scene(gaussians, place_cameras(*PLACES), 0.3, 12.0, tour=SceneTour(((0, 1, 0.5), (1, 2, 0.5))))
 
 
 def _without_walls(scene: Scene, views: tuple[int, ...]) -> Scene:
@@ -34,14 +35,14 @@ def _without_walls(scene: Scene, views: tuple[int, ...]) -> Scene:
 
 def test_rooms_are_those_of_the_plan(rooms: Scene) -> None:
     found = find_rooms(TourFacts(rooms))
-    assert [views for views, _ in found.outlines] == [(0,), (1,), (2,)] and found.houses == ((0, 1, 2),)
-    assert [outline.area for _, outline in found.outlines] == pytest.approx([22.5] * 3, rel=0.02)
+    assert [room.panoramas for room in found.plan.rooms] == [(0,), (1,), (2,)] and found.houses == ((0, 1, 2),)
+    assert [room.shape.area for room in found.plan.rooms] == pytest.approx([22.5] * 3, rel=0.02)
     assert found.floors == pytest.approx([1.5] * 3, rel=0.02) and found.ceilings == pytest.approx([1.1] * 3, rel=0.02)
 
 
 def test_a_house_with_walls_of_fewer_than_half_of_its_rooms_is_hidden(rooms: Scene) -> None:
     half = find_rooms(TourFacts(_without_walls(rooms, (1,))))
-    assert half.houses == ((0, 1, 2),) and [views for views, _ in half.outlines] == [(0,), (2,), (1,)]
+    assert half.houses == ((0, 1, 2),) and [room.panoramas for room in half.plan.rooms] == [(0,), (2,), (1,)]
     assert find_rooms(TourFacts(_without_walls(rooms, (1, 2)))).houses == ()
 
 
@@ -54,14 +55,13 @@ def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
     assert find_rooms(TourFacts(above)).houses == ((0, 1), (2,))
 
 
-def test_a_floor_without_walls_ends_where_most_of_it_does(rooms: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_floor_without_walls_ends_where_most_of_it_does(rooms: Scene) -> None:
     """A tenth of the horizon looks through a window to each side, where the floor seems to go on."""
     azimuths = (np.arange(360) + 0.5) * np.pi / 180
     rays = np.stack((np.sin(azimuths), np.cos(azimuths)), axis=1)
     ends = 2.0 / np.abs(rays).max(axis=1)
     beyond = np.abs((azimuths + np.pi / 4) % (np.pi / 2) - np.pi / 4) < np.pi / 10
     corners = rays * np.where(beyond, 6.0, ends)[:, None] + np.array((5.0, 0.0))
-    floor = FloorOutline(np.array((5.0, 0.0)), corners, 1.5)
-    monkeypatch.setattr(plan_module, "find_floor_outline", lambda *_: floor)
-    outlines = dict(find_rooms(TourFacts(_without_walls(rooms, (1,)))).outlines)
-    assert outlines[1,].bounds == pytest.approx((3.0, -2.0, 7.0, 2.0), abs=0.1)
+    floor, surfaces = FloorOutline(corners, 1.5), TourFacts(rooms).surfaces[1]
+    outline = _enclose(surfaces, floor, np.eye(2), shapely.Polygon(), 1.5)
+    assert shapely.Polygon(outline).bounds == pytest.approx((3.0, -2.0, 7.0, 2.0), abs=0.1)

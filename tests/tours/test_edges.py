@@ -8,7 +8,7 @@ import torch
 
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.tours.edges import find_poor_edges, find_walls, judge_edges, measure_doubled
+from pansplat.tours.edges import find_poor_edges, find_walls, measure_doubled
 from pansplat.tours.surfaces import Surfaces, find_surfaces
 
 
@@ -26,17 +26,12 @@ def bend(room: Scene, factor: float) -> Scene:
     return dataclasses.replace(room, gaussians=dataclasses.replace(gaussians, means=means))
 
 
-def locate(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
-    surfaces = find_surfaces(scene, np.eye(3))[view]
-    return surfaces.opaque, surfaces.colors
-
-
 def name(scene: Scene, *nodes: int) -> dict[int, Surfaces]:
     return dict(zip(nodes, find_surfaces(scene, np.eye(3)), strict=True))
 
 
 def measure(scene: Scene) -> float:
-    return measure_doubled(locate(scene, 0), locate(scene, 1), (scene.cam2world[1] - scene.cam2world[0])[:3, 3].numpy())
+    return measure_doubled(*find_surfaces(scene, np.eye(3)))
 
 
 def test_surfaces_of_one_room_are_seen_once_and_bent_ones_twice(room: Scene) -> None:
@@ -44,31 +39,30 @@ def test_surfaces_of_one_room_are_seen_once_and_bent_ones_twice(room: Scene) -> 
     assert agreeing < 0.05
     shares = [measure(bend(room, factor)) for factor in (1.05, 1.3)]
     assert agreeing <= shares[0] < 0.5 * shares[1]
-    first, second = locate(room, 0), locate(room, 1)
-    way = np.array((1.0, 0, 0))
-    larger = [(3 * places, colors) for places, colors in (first, second)]
-    assert measure_doubled(*larger, 3 * way) == pytest.approx(agreeing, abs=0.02), "any unit"
-    assert measure_doubled(second, first, -way) == pytest.approx(agreeing, abs=0.02), "either way"
-    plain = [(places, np.full_like(colors, 0.5)) for places, colors in (locate(bend(room, 1.3), n) for n in (0, 1))]
-    assert measure_doubled(*plain, way) == 0, "what has one colour is not seen twice"
-    assert measure_doubled((first[0][:0], first[1][:0]), second, way) == 1
+    first, second = find_surfaces(room, np.eye(3))
+    larger = [dataclasses.replace(own, center=3 * own.center, places=3 * own.places) for own in (first, second)]
+    assert measure_doubled(*larger) == pytest.approx(agreeing, abs=0.02), "any unit"
+    assert measure_doubled(second, first) == pytest.approx(agreeing, abs=0.02), "either way"
+    bent = find_surfaces(bend(room, 1.3), np.eye(3))
+    plain = [dataclasses.replace(own, base=torch.zeros_like(own.base)) for own in bent]
+    assert measure_doubled(*plain) == 0, "what has one colour is not seen twice"
+    none = Surfaces(first.center, first.places[:0], first.is_opaque[:0], first.base[:0])
+    assert measure_doubled(none, second) == 1
 
 
 def test_only_the_directions_of_a_flight_count(room: Scene) -> None:
-    places, colors = locate(room, 1)
+    first, second = find_surfaces(room, np.eye(3))
+    places = second.places
     aside = np.abs(places[:, 0] + 0.5) < np.abs(places[:, 2])  # beyond 45 degrees of the way, from its middle
-    moved = np.where(aside[:, None], 3 * places, places)
-    assert measure_doubled(locate(room, 0), (moved, colors), np.array((1.0, 0, 0))) < 0.1
-    moved = np.where(aside[:, None], places, 3 * places)
-    assert measure_doubled(locate(room, 0), (moved, colors), np.array((1.0, 0, 0))) > 0.2
+    for is_moved, low, high in ((aside, 0, 0.1), (~aside, 0.2, 1)):
+        moved = dataclasses.replace(second, places=np.where(is_moved[:, None], 3 * places, places))
+        assert low <= measure_doubled(first, moved) < high
 
 
 def test_an_edge_is_poor_if_its_surfaces_disagree(room: Scene) -> None:
     edges = [(4, 7), (4, 4), (4, 9)]
-    room, small = (name(scene, 4, 7) for scene in (room, bend(room, 0.35)))
-    (good,), (bad,) = (judge_edges(surfaces, edges).items() for surfaces in (room, small))
-    assert good[0] == bad[0] == (4, 7) and 0 < good[1] < bad[1] - 0.2
-    assert find_poor_edges(room, edges) == () and find_poor_edges(small, edges) == ((4, 7),)
+    agreeing, bent = (name(scene, 4, 7) for scene in (room, bend(room, 0.35)))
+    assert find_poor_edges(agreeing, edges) == () and find_poor_edges(bent, edges) == ((4, 7),)
 
 
 @pytest.mark.parametrize(

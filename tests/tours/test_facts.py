@@ -9,7 +9,7 @@ import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.export.plan_files import write_plan
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.tours import facts
 from pansplat.tours.facts import TourFacts
 
@@ -22,7 +22,7 @@ def scene() -> Scene:
     poses = place_cameras((0.0, 0.0, 0.0), (1.0, 0.0, 0.5))
     low, high = torch.tensor((-2.0, -1.1, -2.5)), torch.tensor((2.5, 1.5, 2.0))
     views = [make_balls(see_box(low, high, pose[:3, 3], 20000), 0.02, 1.0, views=k) for k, pose in enumerate(poses)]
-    return Scene(Gaussians.cat(views), poses, 0.45, 10.0, names=("a", "b"), overlaps=((0, 1, 0.5),))
+    return Scene(Gaussians.cat(views), poses, 0.45, 10.0, names=("a", "b"), tour=SceneTour(((0, 1, 0.5),)))
 
 
 def forbid(*_: object) -> None:
@@ -58,7 +58,7 @@ def test_what_depends_on_a_change_is_computed_again(what: str, scene: Scene, tmp
         "surfaces": {"gaussians": dataclasses.replace(gaussians, means=gaussians.means * 1.1)},
         "opacities": {"gaussians": dataclasses.replace(gaussians, opacities=gaussians.opacities * 0.2)},
         "poses": {"cam2world": poses},
-        "edges": {"overlaps": ((0, 0, 1.0), (1, 1, 1.0))},
+        "edges": {"tour": SceneTour(((0, 0, 1.0), (1, 1, 1.0)))},
         "names": {"names": ("hall", "b")},
     }
     computed = TourFacts(scene, folder=tmp_path)

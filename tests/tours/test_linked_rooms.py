@@ -11,9 +11,9 @@ import shapely
 import torch
 from numpy.testing import assert_allclose
 
-from pansplat.inputs.pairs import Link, Panorama
-from pansplat.tours.graph import DrawnPlace, TourGraph
-from pansplat.tours.linked_rooms import place_rooms
+from pansplat.inputs.panorama_sets import Link, Panorama
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
 
 UNIT, WALL = 1.5, 0.12  # height of the cameras, thickness of a wall
 HALL, BATH, BED, LOFT = range(4)

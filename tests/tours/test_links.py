@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.panorama_sets import Link
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.links import find_link_ring
-from pansplat.tours.outlook import BINS, find_bin
+from pansplat.tours.outlook import BINS, find_bins
 
 
 def _link(tour: TourGraph, pitch: float) -> TourGraph:
@@ -29,7 +29,7 @@ def test_a_ring_off_the_floor_is_on_the_wall_in_the_direction_of_the_link(make_t
         tour = _link(make_tour(((0, 0), (0, 1)), ((0, 0), (1, 1))), pitch)
         for wall, distance in ((2.0, 2.0), (0.0, 3.0)):
             outlook = np.zeros(BINS)
-            outlook[find_bin(0.5 * math.pi)] = wall
+            outlook[find_bins(np.array(0.5 * math.pi))] = wall
             assert np.allclose(find_link_ring(tour, 0, 1, 1.5, outlook), (distance, distance * math.tan(pitch), 0))
 
 

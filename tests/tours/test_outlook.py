@@ -13,6 +13,7 @@ from pansplat.tours.outlook import (
     BINS,
     find_clearance,
     find_hidden,
+    find_turns,
     find_widest,
     measure_clearance,
     measure_outlook,
@@ -57,6 +58,15 @@ def test_the_widest_view_is_over_several_directions_and_the_sky_does_not_count()
     sky = np.zeros(BINS)
     sky[6] = 5.0
     assert find_widest(sky) == pytest.approx((5.5 / BINS - 0.5) * 2 * math.pi)
+
+
+def test_an_arrival_turns_from_a_close_wall_to_the_nearest_open_view():
+    outlook = np.full(BINS, 0.8)
+    outlook[:4], outlook[14:18] = 4.0, 2.0
+    turned = (np.arange(BINS) + np.round(find_turns(outlook) / (2 * math.pi) * BINS).astype(int)) % BINS
+    assert turned[[0, 2, 16]].tolist() == [0, 2, 16], "open"
+    assert turned[[6, 12, 21]].tolist() == [4, 14, 23], "the nearest one, to the left or right"
+    assert not find_turns(np.full(BINS, 0.8)).any() and not find_turns(np.zeros(BINS)).any()
 
 
 def test_marks_are_hidden_by_what_is_in_front_of_them_only():

@@ -16,14 +16,14 @@ from synthetic_scenes import make_balls
 
 from pansplat.errors import InputError
 from pansplat.export.plan_files import _Drawing, describe_plan, write_plan
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
 from pansplat.system.files import is_written
 from pansplat.tours import plan as plan_module
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.plan import Plan, _Lines, _separate, _Sight, _trace_outline
-from pansplat.tours.surfaces import ray_directions
+from pansplat.tours.surfaces import RAY_DIRECTIONS
 
 _CEILING, DOOR_TOP, CAMERA_HEIGHT = 2.6, 2.0, 1.5
 
@@ -98,7 +98,7 @@ def _make_house(
     labels = torch.from_numpy(np.concatenate(views))
     gaussians = make_balls(torch.from_numpy(np.concatenate(means)), 0.02, 1.0, views=labels)
     edges = tuple((k, k + 1, 0.5) for k in range(len(cameras) - 1)) if len(cameras) > 1 else ((0, 0, 1.0),)
-    return Scene(gaussians, torch.stack(poses), 0.45, 10.0, names=tuple(names), overlaps=edges)
+    return Scene(gaussians, torch.stack(poses), 0.45, 10.0, names=tuple(names), tour=SceneTour(edges))
 
 
 L_ROOM = [(0.0, 0.0), (5.0, 0.0), (5.0, 3.0), (3.0, 3.0), (3.0, 6.0), (0.0, 6.0)]  # 24 square metres
@@ -123,7 +123,7 @@ def _measure_angles(outline: np.ndarray) -> list[float]:
 def test_rooms_have_their_areas_angles_and_corners(noise: float) -> None:
     plan = _plan(_make_house(WALLS, CAMERAS, turn_degrees=17, noise=noise))
     assert [(room.panoramas, len(room.outline)) for room in plan.rooms] == [((0, 1), 6), ((2,), 4)]
-    assert [room.area for room in plan.rooms] == pytest.approx([24.0, 15.6], rel=0.02)
+    assert [room.shape.area for room in plan.rooms] == pytest.approx([24.0, 15.6], rel=0.02)
     turn = math.radians(17)
     axes = np.array(((math.cos(turn), math.sin(turn)), (-math.sin(turn), math.cos(turn))))
     for room, corners in zip(plan.rooms, (L_ROOM, HALL), strict=True):
@@ -147,7 +147,7 @@ def test_a_room_of_two_panoramas_has_their_common_name_and_its_area(tmp_path: Pa
 def test_an_oblique_wall_stays_oblique() -> None:
     corners = [(0.0, 0.0), (5.0, 0.0), (5.0, 2.0), (3.0, 4.0), (0.0, 4.0)]
     (room,) = _plan(_make_house(_walls_around(corners), [(2.0, 1.8)])).rooms
-    assert room.area == pytest.approx(18.0, rel=0.02)
+    assert room.shape.area == pytest.approx(18.0, rel=0.02)
     assert sorted(_measure_angles(room.outline)) == pytest.approx([45, 45, 90, 90, 90], abs=1)
 
 
@@ -174,7 +174,8 @@ def test_the_uncertainty_of_walls_is_the_disagreement_of_the_panoramas_that_show
     assert shifted.wall_error == pytest.approx(0.06 / math.sqrt(2), rel=0.25)
     room = shifted.rooms[0]
     walls = math.sqrt(sum(side**2 for side in (5, 3, 2, 3, 3, 6)))
-    assert shifted.area_error(room) == pytest.approx(math.hypot(shifted.wall_error * walls, 0.2 * room.area), rel=0.05)
+    expected = math.hypot(shifted.wall_error * walls, 0.2 * room.shape.area)
+    assert shifted.area_error(room) == pytest.approx(expected, rel=0.05)
     alone = _plan(_make_house(_walls_around(HALL), CAMERAS[2:]))
     assert alone.wall_error is None and alone.scale_error is None
     assert alone.area_error(alone.rooms[0]) == pytest.approx(0.2 * 15.6, rel=0.05), "of its shape"
@@ -190,11 +191,11 @@ def test_the_plan_does_not_depend_on_the_unit_of_length() -> None:
 def test_a_corridor_whose_end_is_no_wall_ends_at_the_farthest_surface() -> None:
     right, ahead, left, behind = 1.6, 1.5, -2.0, -1.5
     lines = _Lines(np.array(((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0))), np.array((right, ahead, left, behind)))
-    reach = lines.offsets / (ray_directions() @ lines.normals.T)
+    reach = lines.offsets / (RAY_DIRECTIONS @ lines.normals.T)
     reach = np.where(reach > 0, reach, np.inf).min(axis=1)
     corridor = slice(11, 47)  # degrees: along the right wall, through the wall ahead
-    reach[corridor] = np.minimum(right / ray_directions()[corridor, 0], 4.3)
-    walls = reach[:, None] * ray_directions()
+    reach[corridor] = np.minimum(right / RAY_DIRECTIONS[corridor, 0], 4.3)
+    walls = reach[:, None] * RAY_DIRECTIONS
     outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
     assert outline is not None
     assert outline.bounds[:3] == pytest.approx((left, behind, right), abs=1e-6)
@@ -205,11 +206,11 @@ def test_a_room_stays_closed_where_no_wall_explains_what_is_seen_at_a_corner() -
     """Beyond the corner a sixth of the horizon looks into another room, which ends in a line with a wall ahead."""
     normals, offsets = ((1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 1.0)), (1.6, 1.24, -1.74, -1.6, 0.6)
     lines = _Lines(np.array(normals), np.array(offsets))
-    reach = lines.offsets / (ray_directions() @ lines.normals.T)
+    reach = lines.offsets / (RAY_DIRECTIONS @ lines.normals.T)
     reach = np.where(reach > 0, reach, np.inf)
     seen = reach[:, :4].min(axis=1)
     seen[230:282], seen[282:288] = 4.0, reach[282:288, 4]
-    walls = seen[:, None] * ray_directions()
+    walls = seen[:, None] * RAY_DIRECTIONS
     outline = _trace_outline(_Sight(np.zeros(2), walls, walls, walls[:0]), lines, 1.5)
     assert outline is not None
     assert outline.bounds == pytest.approx((-1.74, -1.6, 1.6, 1.24)) and outline.area == pytest.approx(3.34 * 2.84)
@@ -268,7 +269,7 @@ def test_a_room_without_a_ceiling_ends_where_its_floor_does() -> None:
     scene = _make_house(_walls_around(HALL), CAMERAS[2:])
     open_room = scene.gaussians.select(scene.gaussians.means[:, 1] > -0.8)
     (room,) = _plan(dataclasses.replace(scene, gaussians=open_room)).rooms
-    assert room.area == pytest.approx(15.6, rel=0.05)
+    assert room.shape.area == pytest.approx(15.6, rel=0.05)
 
 
 def _two_storeys() -> Scene:
@@ -307,7 +308,7 @@ def test_storeys_are_next_to_each_other_in_metres_with_names_and_areas(tmp_path:
 def test_a_room_at_an_approximate_place_is_dashed_where_its_neighbour_has_it(tmp_path: Path) -> None:
     """The hall is in a world of its own, and then half a metre farther to the right than in one world."""
     house = _make_house(WALLS, CAMERAS)
-    scene = dataclasses.replace(house, overlaps=((0, 1, 0.5), (2, 2, 1.0)), approximate=((2, 0, 6.0, 0.5, 0.0),))
+    scene = dataclasses.replace(house, tour=SceneTour(((0, 1, 0.5), (2, 2, 1.0)), (), ((2, 0, 6.0, 0.5, 0.0),)))
     drawings = [_Drawing(_plan(each)) for each in (house, scene)]
     offsets = [
         np.subtract(*(drawing.outline(room).mean(axis=0) for room in drawing.plan.rooms)) for drawing in drawings
@@ -330,8 +331,7 @@ def test_texts_are_neither_on_walls_nor_on_dots_nor_on_one_another() -> None:
     scene = dataclasses.replace(
         house,
         gaussians=house.gaussians.select(house.gaussians.views < 3),
-        overlaps=((0, 1, 0.5), (1, 3, 0.5), (2, 2, 1.0)),
-        approximate=((2, 0, 1.6, 0.4, 0.0),),
+        tour=SceneTour(((0, 1, 0.5), (1, 3, 0.5), (2, 2, 1.0)), (), ((2, 0, 1.6, 0.4, 0.0),)),
     )
     drawing = _Drawing(_plan(scene))
     assert [room.panoramas for room in drawing.plan.rooms] == [(0, 1), (3,), (2,)]
@@ -402,7 +402,7 @@ def test_a_room_that_is_not_placed_is_upright_beside_the_others_and_no_camera_hi
 def test_scenes_without_a_plan_are_refused(tmp_path: Path) -> None:
     scene = _make_house(_walls_around(HALL), CAMERAS[2:])
     few = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(5)))
-    none = dataclasses.replace(few, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), overlaps=(), names=())
+    none = dataclasses.replace(few, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), tour=None, names=())
     for bad in (few, none):
         with pytest.raises(InputError, match="needed a floor, and walls around"):
             write_plan(bad, tmp_path / "plan.svg")

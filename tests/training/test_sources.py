@@ -10,7 +10,7 @@ import pytest
 import torch
 from refusals import expect_error
 
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat.inputs.views import collate
 from pansplat.training.config import DataConfig
 from pansplat.training.sources import PairSource, TripletSource, load_sources, read_game_maps, read_panogrf
@@ -78,7 +78,7 @@ def test_pairs_need_targets_and_a_random_one_is_chosen(
     (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
     groups = {"pairs": [{"context": ["0.png", "4.png"], "target": ["1.png", "2.png", "3.png"]}]}
     (tmp_path / "pairs.json").write_text(json.dumps(groups))
-    pairs = load_pairs(tmp_path)
+    pairs = load_sets(tmp_path)
     chosen = {PairSource(pairs).sample(0, 8, seed).targets.names for seed in range(20)}
     assert chosen == {("1",), ("2",), ("3",)}
     expect_error("needed pairs with targets for training, got none", PairSource, [])

@@ -21,12 +21,14 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.images.image_files import write_image
-from pansplat.inputs.pairs import Link, Pair, Panorama
+from pansplat.inputs.panorama_sets import Link, Panorama, PanoramaSet
 from pansplat.rendering import Rendering, rasterize
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
-from pansplat.tours.graph import TourGraph, merge_scenes
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.merge import merge_scenes
 from pansplat.tours.outlook import BINS
+from pansplat.tours.scene_views import choose_scene_views
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
 from pansplat_viewer.draw.frame_renderer import FrameRenderer
 from pansplat_viewer.draw.offscreen import create_context
@@ -304,8 +306,8 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     tour = entry.tour
     assert tour is not None
     if not entry.views:
-        views = next(iter(tour.choose_scene_views().values()))
-        entry = SceneEntry(entry.name, pair=tour.make_pair(views), tour=tour, views=views)
+        views = next(iter(choose_scene_views(tour).values()))
+        entry = SceneEntry(entry.name, pair=tour.make_set(views), tour=tour, views=views)
     directions, cam2world = fibonacci_directions(500), tour.cam2world[list(entry.views)]
     color = torch.tensor((0.3, 0.5, 0.7)).roll(sum(entry.views)) + 0.2 * directions
     parts = [
@@ -316,7 +318,7 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
     angles = torch.linspace(0, 2 * torch.pi, 13)[:-1]
     corners = torch.stack((angles.sin(), angles.cos()), dim=1).double().numpy()
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
-    outlines = {view: FloorOutline(center, center + corners, 1.0) for view, center in centers.items()}
+    outlines = {view: FloorOutline(center + corners, 1.0) for view, center in centers.items()}
     facts = TourFacts(scene, tour, entry.views)
     outlooks = np.zeros((len(entry.views), BINS))
     vars(facts).update(
@@ -331,11 +333,11 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
 
 
 @pytest.fixture(scope="session")
-def pair(axis_photos, small_scene, tmp_path_factory) -> Pair:
+def pair(axis_photos, small_scene, tmp_path_factory) -> PanoramaSet:
     """The two photographs at the cameras of the small scene."""
     folder = tmp_path_factory.mktemp("pair")
     panoramas = []
     for name, image, pose in zip(small_scene.names, axis_photos, small_scene.cam2world, strict=True):
         write_image(folder / name, image)
         panoramas.append(Panorama(name, folder / name, pose))
-    return Pair("pair", folder, tuple(panoramas), (), 0.45, 10.0)
+    return PanoramaSet("pair", folder, tuple(panoramas), (), 0.45, 10.0)

@@ -24,8 +24,8 @@ from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_fro
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Note, Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Note, Panorama
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece
@@ -741,7 +741,7 @@ def placing_user(user, tmp_path, monkeypatch) -> User:
     def find(path: Path, show: object) -> list[SceneEntry]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_pairs(path))]
+            return [SceneEntry(tour.name, tour=tour) for tour in find_tours(load_sets(path))]
 
     def read(image: Path) -> Piece:
         depth = DepthMap(np.zeros((32, 64)), np.full((8, 16), 0.05), np.eye(3))

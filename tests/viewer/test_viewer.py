@@ -22,7 +22,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.path import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.progress import report_progress
 from pansplat.tours.camera_path import CameraPath
@@ -501,7 +501,7 @@ def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
     panorama = Panorama("alone", tmp_path / "alone.png", torch.eye(4, dtype=torch.float64))
     for start, yaw in ((None, 2 * np.pi * (98 / 128 - 0.5)), ((0.5, 0.0), 0.5)):
         app = make_app()
-        pair = Pair("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
+        pair = PanoramaSet("alone", tmp_path, (replace(panorama, start=start),), (), 0.45, 10.0)
         app.scenes.show([SceneEntry("alone", pair=pair)], 0)
         assert app.state.camera == app.state.home
         assert app.state.camera.yaw_radians == pytest.approx(yaw, abs=0.1)
@@ -575,7 +575,7 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
 
     def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
         if not entry.views:
-            return load_house(replace(entry, views=(0, 1), pair=house.make_pair((0, 1)), max_views=64))
+            return load_house(replace(entry, views=(0, 1), pair=house.make_set((0, 1)), max_views=64))
         facts = {
             "outlines": {},
             "views": (),
@@ -667,7 +667,7 @@ def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_pre
         app = make_app()
         gate = Gate(lambda entry: load_entry(entry, options), "waiting", 0.0)
         app.load = gate
-        app.scenes.show([SceneEntry("room", pair=house.make_pair(views))], 0)
+        app.scenes.show([SceneEntry("room", pair=house.make_set(views))], 0)
         for _ in range(20):
             app.frame(0.2, held=frozenset("w"))
         gate.open()

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 
 
 def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: int = 0) -> Scene:
@@ -65,7 +65,7 @@ def plain_scene() -> Scene:
 @pytest.fixture(scope="session")
 def house(scene: Scene) -> Scene:
     """The scene as that of a tour: the three views in a row, two edges."""
-    return dataclasses.replace(scene, overlaps=((0, 1, 0.5), (1, 2, 0.4)))
+    return dataclasses.replace(scene, tour=SceneTour(((0, 1, 0.5), (1, 2, 0.4))))
 
 
 @pytest.fixture(scope="session")
@@ -84,20 +84,22 @@ def flat() -> Scene:
         gaussians=dataclasses.replace(scene.gaussians, means=means),
         cam2world=poses,
         names=("room 0", "room 1", "</script><b>hall", "attic"),
-        overlaps=((0, 1, 0.5), (2, 2, 1.0), (3, 3, 1.0)),
-        links=((0, 2, 0.5 * math.pi, 0.6, "<i>down"), (2, 0, 0.0, 0.3, "")),
+        tour=SceneTour(
+            ((0, 1, 0.5), (2, 2, 1.0), (3, 3, 1.0)),
+            ((0, 2, 0.5 * math.pi, 0.6, "<i>down"), (2, 0, 0.0, 0.3, "")),
+        ),
         starts=((0.3, 0.2), None, None, (1.0, -0.2)),
     )
 
 
 @pytest.fixture(scope="session")
-def take_photographs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scene, int], list[Pair]]:
+def take_photographs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scene, int], list[PanoramaSet]]:
     """A function that writes smooth random panoramas of a height for the cameras of a scene to a new folder.
 
     It returns a pair of one view each. They are not what the Gaussians show.
     """
 
-    def take(scene: Scene, height: int) -> list[Pair]:
+    def take(scene: Scene, height: int) -> list[PanoramaSet]:
         folder, pairs = tmp_path_factory.mktemp("photographs"), []
         for view, pose in enumerate(scene.cam2world):
             noise = np.random.default_rng(view).uniform(60, 220, (16, 32, 1)) + np.array((0, 10, 0))
@@ -106,7 +108,7 @@ def take_photographs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scen
             pixels = pixels + np.linspace(-30, 30, height)[:, None, None]
             path = folder / f"{view}.png"
             Image.fromarray(pixels.clip(1, 255).astype(np.uint8)).save(path)
-            pairs.append(Pair(f"{view}", folder, (Panorama(f"{view}", path, pose),), (), 0.5, 10.0, (path,)))
+            pairs.append(PanoramaSet(f"{view}", folder, (Panorama(f"{view}", path, pose),), (), 0.5, 10.0, (path,)))
         return pairs
 
     return take

@@ -27,17 +27,17 @@ from pansplat.export import page as page_module
 from pansplat.export.page import write_page
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
-from pansplat.gaussians.scene import Gaussians, Scene
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.refinement.budget import merge_to
 from pansplat.system.atomic import replacing
 from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_floor
-from pansplat.tours.graph import make_graph, select_views
-from pansplat.tours.outlook import find_bin, measure_clearance, measure_outlook
+from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.outlook import find_bins, measure_clearance, measure_outlook
 from pansplat.tours.surfaces import find_surfaces
 
 
@@ -52,6 +52,12 @@ def read_header(path: Path) -> dict[str, Any]:
     return json.loads(header)
 
 
+def read_start(path: Path) -> list[float]:
+    """Yaw and pitch of the first view of a page."""
+    header = read_header(path)
+    return header["spots"][header["walk"][0]]["ahead"]
+
+
 def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
     written = write_page(scene, tmp_path / "tour.html")
     header = read_header(tmp_path / "tour.html")
@@ -59,7 +65,7 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
     assert written.num_bytes == (tmp_path / "tour.html").stat().st_size
     assert written.num_gaussians == header["count"] == len(scene.gaussians) and header["degree"] == 1
     assert [spot["name"] for spot in header["spots"]] == ["room 0", "room 1", "room 2"]
-    steps = np.diff([view["position"] for view in header["views"]], axis=0)
+    steps = np.diff([spot["position"] for spot in header["spots"]], axis=0)
     assert np.allclose(steps, np.diff(scene.cam2world[:, :3, 3].numpy(), axis=0), atol=1e-6)
     level = np.array(header["level"])
     assert np.allclose(level @ level.T, np.eye(3), atol=1e-6) and np.linalg.det(level) > 0
@@ -109,18 +115,20 @@ def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Sc
     """Half of the surfaces around the first camera come close, those ahead."""
     level, gaussians = make_graph(house).level_axes, house.gaussians
     write_page(house, tmp_path / "free.html")
-    yaw = read_header(tmp_path / "free.html")["start"]["yaw"]
+    yaw = read_start(tmp_path / "free.html")[0]
     ahead = torch.from_numpy(level @ (math.sin(yaw), 0, math.cos(yaw))).float()
     offsets = gaussians.means - house.cam2world[0, :3, 3].float()
     close = (gaussians.views == 0) & (offsets @ ahead > 0.3 * offsets.norm(dim=1))
     means = torch.where(close[:, None], house.cam2world[0, :3, 3].float() + 0.2 * offsets, gaussians.means)
     facing = dataclasses.replace(house, gaussians=dataclasses.replace(gaussians, means=means))
     write_page(facing, tmp_path / "wall.html")
-    assert math.cos(read_header(tmp_path / "wall.html")["start"]["yaw"] - yaw) < 0
+    turns = read_header(tmp_path / "wall.html")["spots"][0]["turns"]
+    assert abs(turns[find_bins(np.array(yaw))]) > 0.5 and turns[find_bins(np.array(yaw + math.pi))] == 0, "on arrival, too"
+    assert math.cos(read_start(tmp_path / "wall.html")[0] - yaw) < 0
     local = house.cam2world[0, :3, :3].numpy().T @ ahead.numpy()
     start = math.atan2(local[0], local[2]), math.asin(local[1])
     write_page(dataclasses.replace(facing, starts=(start, None, None)), tmp_path / "start.html")
-    assert math.cos(read_header(tmp_path / "start.html")["start"]["yaw"] - yaw) == pytest.approx(1, abs=1e-5)
+    assert math.cos(read_start(tmp_path / "start.html")[0] - yaw) == pytest.approx(1, abs=1e-5)
 
 
 def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tmp_path: Path) -> None:
@@ -138,7 +146,10 @@ def test_without_a_floor_there_is_no_dolls_house_and_no_outline(scene: Scene, tm
 def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Path) -> None:
     """The nearest ones of two parts without a link; others have that of their tour."""
     walls = tuple((node, alone, 0.0) for alone in (2, 3) for node in (0, 1))
-    write_page(dataclasses.replace(flat, overlaps=(*flat.overlaps, *walls)), tmp_path / "page.html")
+    write_page(
+        dataclasses.replace(flat, tour=SceneTour((*flat.tour.overlaps, *walls), flat.tour.links)),
+        tmp_path / "page.html",
+    )
     header = read_header(tmp_path / "page.html")
     spots, level = header["spots"], np.array(header["level"])
     places = np.array([spot["position"] for spot in spots])
@@ -159,7 +170,7 @@ def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch
     assert (poor.num_flights, len(poor.fades)) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
     assert poor.fades == tuple(zip(house.names[:2], house.names[1:], strict=True)), "the labels"
     assert set(header["parts"]) == {0} and header["walk"] == [0, 1, 2]
-    joint = dataclasses.replace(house, joint=True, overlaps=())
+    joint = dataclasses.replace(house, joint=True, tour=None)
     assert write_page(joint, tmp_path / "joint.html").fades == ()
 
 
@@ -169,10 +180,7 @@ def test_the_page_of_a_tour_has_its_edges_and_its_walk(house: Scene, tmp_path: P
     assert [spot["name"] for spot in header["spots"]] == ["hall", "hall", "bath"], "rooms of poses.json"
     assert header["groups"] == [[0, 1], [1, 2]] and header["edges"] == [[0, 1, 0], [1, 2, 1]]
     assert header["next"] == [[0, 1, 1], [0, 1, 2], [1, 1, 2]]
-    assert header["walk"] == [0, 1, 2] and header["start"]["position"] == header["views"][0]["position"]
-    assert header["start"]["yaw"] == pytest.approx(header["spots"][0]["ahead"][0], abs=1e-3), (
-        "not along the first flight"
-    )
+    assert header["walk"] == [0, 1, 2]
 
 
 def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> None:
@@ -180,9 +188,8 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     header = read_header(tmp_path / "tour.html")
     assert header["parts"] == [0, 0, 1, 2] and header["edges"] == [[0, 1, 0], [2, 2, 1], [3, 3, 2]]
     assert header["groups"] == [[0, 1], [2], [3]]
-    start, spots, level = header["start"], header["spots"], np.array(header["level"])
-    assert start["position"] == pytest.approx(spots[0]["position"], abs=1e-5)
-    assert (start["yaw"], start["pitch"]) == (0.3, -0.2)
+    spots, level = header["spots"], np.array(header["level"])
+    assert spots[0]["ahead"] == [0.3, -0.2]
     assert spots[3]["ahead"] == pytest.approx([1.0 + 3 * 0.7, 0.2], abs=1e-5) and spots[1]["ahead"][1] == 0
     assert [spot["hasStart"] for spot in spots] == [True, False, False, True]
     np.testing.assert_allclose(spots[1]["clearances"], measure_clearance(find_surfaces(flat, level)[1]), atol=0.0051)
@@ -191,21 +198,21 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4) and to["pitch"] == -0.6
     right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
-    wall = measure_outlook(find_surfaces(flat, level)[0])[find_bin(0.5 * math.pi)]
+    wall = measure_outlook(find_surfaces(flat, level)[0])[find_bins(np.array(0.5 * math.pi))]
     assert (right, ahead) == pytest.approx((max(down / np.tan(0.6), 1), 0), rel=0.01, abs=1e-5) and right < wall
     assert header["limits"] == pytest.approx([2.0, 1.0, 1.0]), "the part with two views, and single views"
     assert sorted(header["walk"]) == [0, 1, 2, 3] and header["walk"][0] == 0
 
 
 def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(
-    flat: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]]
+    flat: Scene, tmp_path: Path, take_photographs: Callable[..., list[PanoramaSet]]
 ) -> None:
     photographs = take_photographs(flat, 64)
     write_page(flat, tmp_path / "tour.html", photographs=photographs)
     header = read_header(tmp_path / "tour.html")
     assert [view["count"] > 0 for view in header["views"]] == [True, True, False, False]
     assert header["limits"] == [pytest.approx(2.0), 0, 0] and header["loading"] == [0, 1, 2, 3]
-    alone = dataclasses.replace(flat, overlaps=tuple((node, node, 1.0) for node in range(4)))
+    alone = dataclasses.replace(flat, tour=SceneTour(tuple((node, node, 1.0) for node in range(4)), flat.tour.links))
     written = write_page(alone, tmp_path / "alone.html", photographs=photographs)
     assert written.num_gaussians == 0 and read_header(tmp_path / "alone.html")["limits"] == [0] * 4
 
@@ -220,14 +227,16 @@ def test_the_camera_stays_within_a_metre_of_a_single_photograph(
     write_page(dataclasses.replace(single, gaussians=gaussians, starts=((0.4, 0.1),)), tmp_path / "page.html")
     header = read_header(tmp_path / "page.html")
     assert header["limits"] == pytest.approx([limit], abs=0.01)
-    assert (header["start"]["yaw"], header["start"]["pitch"]) == pytest.approx((0.4, -0.1), abs=1e-4)
+    assert header["spots"][0]["ahead"] == pytest.approx([0.4, -0.1], abs=1e-4)
 
 
-def test_panoramas_of_all_parts_keep_as_many_gaussians(flat: Scene) -> None:
-    merged = page_module._merge(flat, (0, 0, 1, 2), 800)
-    counts = np.bincount(merged.gaussians.views.numpy())
-    assert counts[0] + counts[1] == 400 and counts[2] == counts[3] == 200
-    assert torch.equal(merged.cam2world, flat.cam2world)
+def test_panoramas_of_all_parts_that_have_gaussians_keep_as_many(flat: Scene) -> None:
+    without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
+    for scene, count, third in ((flat, 800, 200), (without, 600, 0)):
+        merged = page_module._merge(scene, (0, 0, 1, 2), count)
+        counts = np.bincount(merged.gaussians.views.numpy())
+        assert counts[0] + counts[1] == 400 and counts[2] == third and counts[3] == 200
+        assert torch.equal(merged.cam2world, flat.cam2world)
 
 
 def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
@@ -235,19 +244,10 @@ def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
     assert page_module._choose_share(450_000, [1024] * 5) == page_module._choose_share(450_000, []) == 1
     assert shares[1] < 1
     edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
-    flights = page_module._Flights(
-        torch.eye(4), np.eye(3), 0.0, 0.0, (0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), (), edges
-    )
+    flights = page_module._Flights((0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges, ())
     assert page_module._find_flown_parts(flights, [(2, 3)]) == {0}
     alone = dataclasses.replace(flights, edges=(), parts=(0,) * 5)
     assert page_module._find_flown_parts(alone, ()) == {0}, "of a pair"
-
-
-def test_panoramas_without_gaussians_leave_them_to_others(flat: Scene) -> None:
-    without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
-    merged = page_module._merge(without, (0, 0, 1, 2), 600)
-    counts = np.bincount(merged.gaussians.views.numpy())
-    assert counts[0] + counts[1] == 400 and counts[2] == 0 and counts[3] == 200
 
 
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
@@ -429,7 +429,7 @@ def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Pat
 
 
 def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussians(
-    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], tmp_path: Path
 ) -> None:
     write_page(scene, tmp_path / "tour.html", photographs=take_photographs(scene, 1024))
     header = read_header(tmp_path / "tour.html")
@@ -446,7 +446,7 @@ def test_a_scene_without_cameras_starts_in_its_middle(scene: Scene, tmp_path: Pa
     write_page(bare, tmp_path / "tour.html", gaussians=1000)
     header = read_header(tmp_path / "tour.html")
     assert len(header["views"]) == 1 and header["views"][0]["count"] == header["count"] <= 1000
-    assert header["spots"][0]["name"] == "start" and np.allclose(header["start"]["position"], 0)
+    assert header["spots"][0]["name"] == "start" and np.allclose(header["spots"][0]["position"], 0)
 
 
 def test_gaussians_that_cannot_be_drawn_are_left_out(scene: Scene, tmp_path: Path) -> None:
@@ -503,4 +503,4 @@ def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, t
     assert len(header["spots"]) == 3 and header["edges"] == [] and header["count"] == len(house.gaussians)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        write_page(dataclasses.replace(fused, overlaps=()), tmp_path / "pair.html")
+        write_page(dataclasses.replace(fused, tour=None), tmp_path / "pair.html")

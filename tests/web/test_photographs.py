@@ -24,7 +24,7 @@ from pansplat.export.photographs import PackedPhotograph, label_files, pack_phot
 from pansplat.gaussians.scene import Scene
 from pansplat.images.cube_images import CubeImage, CubeLevel, equirect_from_faces, write_cube
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.pairs import Pair
+from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, is_written
 
 PURPLE = (200, 0, 200)  # of what masks hide; nothing else has so little green
@@ -48,7 +48,7 @@ def grey(scene: Scene) -> Scene:
     return dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, harmonics=harmonics))
 
 
-def hide(photographs: list[Pair], kind: str) -> list[Pair]:
+def hide(photographs: list[PanoramaSet], kind: str) -> list[PanoramaSet]:
     """The photographs with a purple square in the first one, and a mask that hides it; for the kind "none" without."""
     first = photographs[0].context[0]
     pixels = np.asarray(Image.open(first.image)).copy()
@@ -95,19 +95,21 @@ def psnr(a: Float[np.ndarray, "..."], b: Float[np.ndarray, "..."]) -> float:
     return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12))
 
 
-def pack(scene: Scene, photographs: list[Pair], **options: Any) -> list[PackedPhotograph]:
+def pack(scene: Scene, photographs: list[PanoramaSet], **options: Any) -> list[PackedPhotograph]:
     arguments = {"num_bytes": math.inf, "height": None} | options
     return pack_photographs(scene, photographs, **arguments)
 
 
-def test_every_height_of_a_photograph_can_be_packed(scene: Scene, take_photographs: Callable[..., list[Pair]]) -> None:
+def test_every_height_of_a_photograph_can_be_packed(
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]]
+) -> None:
     photographs = take_photographs(scene, 64)
     for height in (1, 2, 3):
         assert {each.height for each in pack(scene, photographs, height=height)} == {max(height, 2)}
 
 
 def test_the_poster_shows_the_photograph_where_the_page_begins(
-    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], tmp_path: Path
 ) -> None:
     photographs = take_photographs(scene, 512)
     Image.new("RGB", (1024, 512), PURPLE).save(photographs[0].context[0].image)
@@ -120,7 +122,7 @@ def test_the_poster_shows_the_photograph_where_the_page_begins(
 
 
 def test_the_tiles_of_the_largest_level_are_the_photograph(
-    scene: Scene, take_photographs: Callable[..., list[Pair]]
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]]
 ) -> None:
     photographs = take_photographs(scene, 1024)
     for view, packed in enumerate(pack(scene, photographs)):
@@ -136,7 +138,7 @@ def test_the_tiles_of_the_largest_level_are_the_photograph(
 
 @pytest.mark.parametrize("height", [None, 200])
 def test_faces_are_no_larger_than_those_of_their_source(
-    scene: Scene, take_photographs: Callable[..., list[Pair]], tmp_path: Path, height: int | None
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], tmp_path: Path, height: int | None
 ) -> None:
     faces = tuple(f"{face}.png" for face in range(6))
     for face in faces:
@@ -155,7 +157,7 @@ def test_names_of_files_are_those_of_panoramas_safe_in_addresses_and_different()
 
 @pytest.mark.parametrize(("kind", "split"), [("mask", False), ("blur", True)])
 def test_what_masks_hide_is_in_no_file_of_a_page(
-    grey: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]], kind: str, split: bool
+    grey: Scene, tmp_path: Path, take_photographs: Callable[..., list[PanoramaSet]], kind: str, split: bool
 ) -> None:
     for chosen, is_hidden in (("none", False), (kind, True)):
         photographs = hide(take_photographs(grey, 512), chosen)
@@ -167,7 +169,7 @@ def test_what_masks_hide_is_in_no_file_of_a_page(
 
 
 def test_a_photograph_shows_the_gaussians_in_what_its_mask_hides_and_itself_elsewhere(
-    grey: Scene, take_photographs: Callable[..., list[Pair]]
+    grey: Scene, take_photographs: Callable[..., list[PanoramaSet]]
 ) -> None:
     (photograph, *_) = hide(take_photographs(grey, 256), "mask")
     image = read_photograph(grey, 0, photograph, 256)
@@ -179,7 +181,7 @@ def test_a_photograph_shows_the_gaussians_in_what_its_mask_hides_and_itself_else
 
 
 def test_photographs_have_the_exposure_of_their_gaussians(
-    scene: Scene, take_photographs: Callable[..., list[Pair]]
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]]
 ) -> None:
     gains = ((1.25, 1.0, 0.8), (0.8, 1.0, 1.25), (1.0, 1.0, 1.0))
     photographs = take_photographs(scene, 64)
@@ -190,7 +192,7 @@ def test_photographs_have_the_exposure_of_their_gaussians(
 
 
 def test_photographs_fit_into_the_bytes_or_have_the_stated_height(
-    scene: Scene, take_photographs: Callable[..., list[Pair]], monkeypatch: pytest.MonkeyPatch
+    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MIN_HEIGHT", 128)
     photographs = take_photographs(scene, 512)
@@ -206,7 +208,7 @@ def test_photographs_fit_into_the_bytes_or_have_the_stated_height(
 
 
 def test_a_new_page_removes_the_tiles_of_the_old_one(
-    plain_scene: Scene, tmp_path: Path, take_photographs: Callable[..., list[Pair]]
+    plain_scene: Scene, tmp_path: Path, take_photographs: Callable[..., list[PanoramaSet]]
 ) -> None:
     photographs = take_photographs(plain_scene, 64)
     first = write_page(plain_scene, tmp_path / "index.html", split=True, photographs=photographs)

@@ -29,7 +29,6 @@ from pansplat.rendering.cpu.display import (
     Layers,
     PixelFaces,
     Selection,
-    SelectionCache,
     blend_layers,
     blend_to_pixels,
 )
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
 
 _MIN_WEIGHT = 2.0**-26  # of a view in deferred blending; as the OpenGL renderer's with 32-bit targets
 _POLL_SECONDS = 0.02  # wait for an image in the background, so that a window does not draw the old one again
-_SHIFT_STEPS = 20  # a metre, to which the movement of an exposure is rounded up, so that selections serve several
 _MAX_FACE_SETS = 5
 _MAX_SELECTIONS = 8
 _MAX_TEXTURES = 4
@@ -127,7 +125,6 @@ class CpuRenderer:
         self._scene: DisplayScene | None = None
         self._colored: tuple[str, DisplayScene] | None = None  # with the colours of a display
         self._groups: dict[Hashable, Int[np.ndarray, "n"]] = {}
-        self._selected = SelectionCache()
         self._faces: OrderedDict[Hashable, _FaceSet] = OrderedDict()
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
         self._picture: _Picture | None = None
@@ -157,7 +154,6 @@ class CpuRenderer:
         self._splats, self._scene = prepared.splats, prepared.scene
         splats = prepared.splats
         self._groups.clear()
-        self._selected = SelectionCache()
         self._faces.clear()
         self._picture = self._texture = self._colored = None
         self.stats = FrameStats(total=len(splats))
@@ -287,7 +283,7 @@ class CpuRenderer:
         start = time.perf_counter()
         focal = frame.focal if frame.settings.layout == "pinhole" else 0.0
         plane = ImagePlane(frame.size[::-1], torch.from_numpy(frame.rotation.copy()), focal)
-        layers = self._rasterize(frame, groups, plane, self._selected)
+        layers = self._rasterize(frame, groups, plane)
         sums, drawn = layers.sums, layers.statistics.visible
         stages = {name: 1e3 * seconds for name, seconds in layers.statistics.seconds.items()}
         pixels = pooled_empty(frame.size[::-1], np.uint32)
@@ -299,17 +295,13 @@ class CpuRenderer:
         stats = self._make_stats(frame, drawn, 1e3 * (now - start), stages)
         return _Picture(frame, pixels, groups, sums, stats)
 
-    def _rasterize(
-        self, frame: Frame, groups: _Groups, plane: ImagePlane, cache: SelectionCache | None = None
-    ) -> Layers:
+    def _rasterize(self, frame: Frame, groups: _Groups, plane: ImagePlane) -> Layers:
         """Rasterise the Gaussians in view of a plane; a panorama has a ray for each pixel."""
         selection = None
         if not plane.is_panorama:
             camera = Pinhole(plane.rotation.numpy(), frame.position, plane.focal, *plane.size[::-1])
-            widening = math.ceil(_SHIFT_STEPS * math.hypot(*frame.settings.shift)) / _SHIFT_STEPS
-            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle + widening / (
-                math.sqrt(12) * frame.settings.near
-            )
+            deviation = math.sqrt(FILTER_VARIANCE) * plane.pixel_angle
+            deviation += math.hypot(*frame.settings.shift) / (math.sqrt(12) * frame.settings.near)
             selection = Selection(camera.compute_side_normals(), deviation)
         return self._find_scene(frame.settings).rasterize(
             np.asarray(frame.position),
@@ -318,7 +310,6 @@ class CpuRenderer:
             len(groups.weights),
             frame.settings.near,
             selection=selection,
-            cache=cache,
             min_transmittance=self._min_transmittance,
             shift=frame.settings.shift,
         )

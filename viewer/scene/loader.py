@@ -20,7 +20,7 @@ from pansplat_viewer.scene.background import BackgroundWorker
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.pairs import Pair, Panorama
+    from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
     from pansplat.tours.facts import TourFacts
     from pansplat.tours.graph import TourGraph
 
@@ -48,7 +48,7 @@ class SceneEntry:
     """
 
     name: str  # shown in the list of scenes and used for output folders
-    pair: "Pair | None" = None
+    pair: "PanoramaSet | None" = None
     file: Path | None = None  # the scene file, or None
     tour: "TourGraph | None" = None  # the tour, or None
     views: tuple[int, ...] = ()  # of one scene of a tour: numbers of its panoramas in the tour
@@ -103,10 +103,10 @@ def find_entries(
     if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if is_scene_file(p)) if path.is_dir() else []
-    from pansplat.pipeline import load_pairs, load_predictor, warn_of_single_views
+    from pansplat.pipeline import load_predictor, load_sets, warn_of_single_views
     from pansplat.tours.graph import find_tours
 
-    def on_unposed(pairs: "list[Pair]") -> None:
+    def on_unposed(pairs: "list[PanoramaSet]") -> None:
         if show is not None:
             show([SceneEntry(tour.name, tour=tour) for tour in find_tours(pairs)])
         report_progress("finding where they were taken", 0.0)
@@ -114,7 +114,7 @@ def find_entries(
     pairs = []
     with collect_notes() as notes:
         try:
-            pairs = load_pairs(path, on_unposed=on_unposed, **vars(reading))
+            pairs = load_sets(path, on_unposed=on_unposed, **vars(reading))
         except InputError as error:
             if not scenes:
                 raise
@@ -179,9 +179,9 @@ def load_entry(
         report_progress("reading", 0.0)
         assert entry.file is not None
         scene = pipeline.load(entry.file)
-        if not scene.overlaps or scene.joint:  # the views of an edge alone lack surfaces of others
+        if scene.tour is None or scene.joint:  # the views of an edge alone lack surfaces of others
             return _with_facts(entry, scene)
-        from pansplat.tours.graph import make_graph
+        from pansplat.tours.merge import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
         return _load_tour_scene(replace(entry, tour=tour, merged=scene), prediction, show)
@@ -212,9 +212,10 @@ def _load_tour_scene(
     """
     from pansplat import pipeline
     from pansplat.tours.facts import TourFacts
-    from pansplat.tours.graph import select_views
     from pansplat.tours.links import link_parts
+    from pansplat.tours.merge import select_views
     from pansplat.tours.overlap import connect
+    from pansplat.tours.scene_views import choose_predictions
 
     tour, views, merged = entry.tour, entry.views, entry.merged
     assert tour is not None
@@ -228,13 +229,13 @@ def _load_tour_scene(
             connected, max_views = connect(tour), pipeline.find_max_views(predictor)
         # A window shows photographs before: they begin where the graph that is not connected yet does.
         first, views = _choose_first_scene(connected, connected if show is None else tour)
-        tour, part = link_parts(connected), connected.choose_predictions(max_views).get(first, views)
+        tour, part = link_parts(connected), choose_predictions(connected, max_views).get(first, views)
         if show is None:
             views = part
         elif views != part:
             prediction = replace(prediction, refine_steps=0)
         entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
-    pair = entry.pair or tour.make_pair(views)
+    pair = entry.pair or tour.make_set(views)
     fitted = pipeline.fit_to_scene(prediction, pair)
 
     def finish(scene: "Scene", is_final: bool) -> LoadedScene:
@@ -252,10 +253,13 @@ def _load_tour_scene(
 
 def _choose_first_scene(tour: "TourGraph", walked: "TourGraph") -> tuple[int, tuple[int, ...]]:
     """The panorama in which the walk of one graph starts, and the scene of its first edge in another one."""
-    first, *others = walked.plan_walk()
+    from pansplat.tours.scene_views import choose_scene_views
+    from pansplat.tours.walks import plan_walk
+
+    first, *others = plan_walk(walked)
     is_flown = others and not walked.is_fade(first, others[0])
     edge = (min(first, others[0]), max(first, others[0])) if is_flown else tour.find_edge(first)
-    scenes = tour.choose_scene_views()
+    scenes = choose_scene_views(tour)
     return first, scenes.get(edge) or scenes[tour.find_edge(first)]
 
 

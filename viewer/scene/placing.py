@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from pansplat.errors import InputError
 from pansplat.geometry.path import wrap_angle
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import Piece, PlanFrame, PlanPose, find_wall_yaw, read_piece
 from pansplat_viewer.scene.background import BackgroundWorker, Report

@@ -17,6 +17,7 @@ from pansplat.geometry.path import (
 )
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
+from pansplat.tours.limits import limit_step
 from pansplat.tours.route import NEAR_OF_FAR, Moment, Route
 from pansplat_viewer.scene.camera import Camera, focus_on_point, move_to_pose
 from pansplat_viewer.scene.picking import PickedPoint
@@ -162,7 +163,7 @@ def limit_camera(state: ViewerState, before: Camera) -> None:
     place = np.array(before.position)
     first, last = bounds.find_nearest_edge(place)[0]
     if first != last or state.tour is None:
-        place = bounds.limit_step(place, np.array(camera.position))
+        place = limit_step(bounds, place, np.array(camera.position))
     state.camera = replace(camera, position=tuple(place.tolist()))
     if state.tour is None and not state.has_stopped and not np.allclose(place, camera.position):
         state.has_stopped = True
@@ -229,7 +230,8 @@ def add_key_frame(state: ViewerState) -> None:
 
 def make_key_frame(camera: Camera, seconds: float) -> KeyFrame:
     """The camera as a key frame."""
-    return KeyFrame.of_pose(camera.cam2world, seconds, camera.vertical_fov_degrees)
+    place, ahead = (tuple(camera.cam2world[:3, column].tolist()) for column in (3, 2))
+    return KeyFrame(seconds, place, ahead, camera.vertical_fov_degrees)
 
 
 def show_path(state: ViewerState, seconds: float) -> None:

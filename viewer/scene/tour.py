@@ -16,9 +16,13 @@ from jaxtyping import Float
 
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.tours.floor import FloorOutline, choose_camera_height
-from pansplat.tours.graph import EDGE_HYSTERESIS, MAX_SCENE_VIEWS, Edge, TourGraph, ViewNumbers, select_views
+from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
+from pansplat.tours.limits import EDGE_HYSTERESIS, follow_edge
 from pansplat.tours.links import link_parts
+from pansplat.tours.merge import select_views
 from pansplat.tours.route import REST_SECONDS, STOP_SECONDS, Moment, Route, plan_route
+from pansplat.tours.scene_views import MAX_SCENE_VIEWS, choose_predictions, choose_scene_views
+from pansplat.tours.walks import find_walk, find_way, plan_walk
 from pansplat_viewer.scene.life import SceneLife
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry
 
@@ -56,11 +60,11 @@ class TourScenes:
         self.outlines: dict[int, FloorOutline] = {}
         self.outlooks: dict[int, np.ndarray] = {}
         self.hidden: dict[int, list[int]] = {}
-        self._views = tour.choose_scene_views()
+        self._views = choose_scene_views(tour)
         everything = tuple(range(len(tour)))
         # The prediction that has the Gaussians of a panorama; none if each scene is a prediction.
         self._providers = (
-            tour.choose_predictions(max_views) if merged is None else dict.fromkeys(everything, everything)
+            choose_predictions(tour, max_views) if merged is None else dict.fromkeys(everything, everything)
         )
         self._sources = {
             views: tuple(dict.fromkeys(self._providers.get(node, views) for node in views))
@@ -116,7 +120,7 @@ class TourScenes:
 
     def make_entry(self, views: ViewNumbers) -> SceneEntry:
         """The prediction of these panoramas as an entry for the loader."""
-        pair = self.tour.make_pair(views)
+        pair = self.tour.make_set(views)
         name = pair.name if len(views) <= MAX_SCENE_VIEWS else f"{len(views)} panoramas"
         return SceneEntry(name, pair=pair, tour=self.tour, views=views)
 
@@ -217,7 +221,7 @@ class TourScenes:
         """Choose an edge that is flown, or that of a camera position."""
         if edge is None or edge not in self._views:  # a wall was found while it was flown along
             tour, known = self.tour, self._is_edge_known
-            edge = tour.follow_edge(position, self.edge) if known else tour.find_nearest_edge(position)[0]
+            edge = follow_edge(tour, position, self.edge) if known else tour.find_nearest_edge(position)[0]
         self.edge, self._is_edge_known = edge, True
 
     def find_nearest(self, position: Float[np.ndarray, "3"]) -> int:
@@ -248,7 +252,8 @@ class TourScenes:
         tour, here = self.tour, set(self.edge)
         middle = tour.positions[list(self.edge)].mean(axis=0)
         inside = [edge for edge in self._views if tour.parts[edge[0]] == self.part]
-        inside.sort(key=lambda edge: (not here & set(edge), tour.measure_distance(edge, middle), tour.length(edge)))
+        away = dict(zip(inside, tour.measure_distances(inside, middle), strict=True))
+        inside.sort(key=lambda edge: (not here & set(edge), away[edge], tour.length(edge)))
         linked = [end for start, end in tour.links if start in here]
         following = (node % len(tour) for node in range(self.edge[1] + 1, self.edge[1] + len(tour)))
         outside = [tour.find_edge(node) for node in (*linked, *following) if tour.parts[node] != self.part]
@@ -284,11 +289,11 @@ class TourScenes:
         if remaining:
             walk = self._find_way(position, remaining[0])
             for a, b in itertools.pairwise(remaining):
-                walk += self.tour.find_walk(a, b)[1:]
+                walk += find_walk(self.tour, a, b)[1:]
         else:
             edge, _ = self.tour.find_nearest_edge(position, self._find_part(position))
             distances = np.linalg.norm(self.tour.positions[list(edge)] - position, axis=1)
-            walk = self.tour.plan_walk(edge[int(distances.argmin())])
+            walk = plan_walk(self.tour, edge[int(distances.argmin())])
         return plan_route(self.tour, walk, camera, rest=REST_SECONDS, outlooks=self.outlooks)
 
     def plan_way(self, camera: Float[np.ndarray, "4 4"], node: int) -> Route:
@@ -296,11 +301,11 @@ class TourScenes:
         return plan_route(self.tour, self._find_way(camera[:3, 3], node), camera, outlooks=self.outlooks)
 
     def _find_way(self, position: Float[np.ndarray, "3"], node: int) -> list[int]:
-        return self.tour.find_way(position, node, self._find_part(position))
+        return find_way(self.tour, position, node, self._find_part(position))
 
     def _find_part(self, position: Float[np.ndarray, "3"]) -> int:
         """The part of a position, which may be that after a jump."""
-        return self.tour.parts[self.tour.follow_edge(position, self.edge)[0]]
+        return self.tour.parts[follow_edge(self.tour, position, self.edge)[0]]
 
     @property
     def camera_height(self) -> float:

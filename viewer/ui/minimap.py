@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from pansplat.system.descriptions import describe_count
 from pansplat.tours.floor import choose_camera_height, find_other_storeys
-from pansplat.tours.graph import DrawnPlace, TourGraph
-from pansplat.tours.linked_rooms import place_rooms
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.tour import TourScenes
 from pansplat_viewer.ui.overlays import FADE_COLOR

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.pairs import Note, Panorama
+from pansplat.inputs.panorama_sets import Note, Panorama
 from pansplat.inputs.photographs import read_notes
 from pansplat.tours.route import STOP_REACH
 

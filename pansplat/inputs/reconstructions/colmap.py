@@ -236,17 +236,7 @@ def write_colmap(
     ]
     files = {"rigs": sensors, "cameras": cameras, "frames": frames, "images": images, "points3D": table}
     for name, lines in files.items():
-        text = "\n".join([f"# {_COLUMNS[name]}; {SOFTWARE}", *lines]) + "\n"
-        (folder / f"{name}.txt").write_text(text, encoding="utf-8")
-
-
-_COLUMNS = {
-    "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, POSE)",
-    "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-    "frames": "FRAME_ID, RIG_ID, RIG_FROM_WORLD, NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)",
-    "images": "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D[] as (X, Y, POINT3D_ID)",
-    "points3D": "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-}
+        (folder / f"{name}.txt").write_text("\n".join([f"# {SOFTWARE}", *lines, ""]), encoding="utf-8")
 
 
 def _format_pose(pose: Float[Tensor, "4 4"]) -> list[float]:

@@ -29,7 +29,7 @@ from pansplat.inputs.poses import from_cam2world, rigid_matrix
 from pansplat.inputs.reconstructions.shots import Reconstruction, find_picture
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.system.atomic import replacing
-from pansplat.system.files import read_file
+from pansplat.system.files import PLY_TYPES, read_file
 from pansplat.system.strict_json import read_field, read_json
 
 FILE = "transforms.json"
@@ -43,11 +43,6 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _SIDE, _FOCAL = Annotated[float, Meta(ge=1, le=1 << 20)], Annotated[float, Meta(ge=1e-6, le=1e9)]
 _LENS = {
     "w": _SIDE, "h": _SIDE, "fl_x": _FOCAL, "fl_y": _FOCAL, **dict.fromkeys(("cx", "cy", *_DISTORTION), float),
-}  # fmt: skip
-_PLY_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _MAX_PLY = 1 << 30  # bytes of the largest point cloud that is read
 
@@ -112,7 +107,7 @@ def _read_points(content: Mapping[str, Any], source: Path) -> Float[Array, "poin
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     order = ">" if ["format", "binary_big_endian", "1.0"] in lines else "<"
     properties = [line for line in lines if line[:1] == ["property"] and len(line) == 3]  # not the lists of faces
-    columns = [(line[2], order + _PLY_TYPES.get(line[1], "")) for line in properties]
+    columns = [(line[2], order + PLY_TYPES.get(line[1], "")) for line in properties]
     try:
         count = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
         if ["format", "ascii", "1.0"] in lines:

@@ -24,7 +24,7 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.images.blur_masks import MASK_SUFFIX, find_mask_beside, fold_name
 from pansplat.images.image_files import READABLE_SUFFIXES
 from pansplat.images.rig_images import Lens, RigImage, RigView, write_rig
-from pansplat.inputs.pairs import FAR, NEAR, Collection, Panorama, find_mask, list_names
+from pansplat.inputs.panorama_sets import FAR, NEAR, Collection, Panorama, find_mask, list_names
 from pansplat.inputs.poses import read_number, rigid_matrix, to_cam2world
 from pansplat.inputs.stated_files import find_inside
 from pansplat.system.components import label_components
@@ -69,12 +69,12 @@ class Reconstruction:
 
     Attributes:
         source: the file that messages name.
-        folder: of the pictures, in whose cache folder joined panoramas are described.
-        convention: of the poses.
+        folder: that of the pictures; joined panoramas are described in its cache folder.
+        convention: that of the poses.
         to_world: from the world of the file to that of the shots, rigid, after `scale`.
         scale: units of the world per unit of the file.
         shots: those whose pictures exist, in the order of the file.
-        points: of the scene, the unit of the file; may be empty.
+        points: points of the scene, in the unit of the file; may be empty.
         is_metric: whether the unit of the file is the metre; otherwise nothing is known of it.
         missing: names of pictures that were not found.
     """

@@ -10,7 +10,7 @@ from pathlib import Path
 from pansplat.errors import InputError
 from pansplat.images.blur_masks import locate_panorama
 from pansplat.images.cube_images import CUBE_SUFFIX
-from pansplat.inputs.pairs import Collection
+from pansplat.inputs.panorama_sets import Collection
 from pansplat.inputs.web_tours.entries import make_panoramas
 from pansplat.inputs.web_tours.marzipano import find_marzipano, read_marzipano
 from pansplat.inputs.web_tours.pannellum import SUFFIXES, find_pannellum, read_pannellum

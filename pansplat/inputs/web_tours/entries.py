@@ -18,8 +18,8 @@ from msgspec import Meta
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.geometry.path import wrap_angle
-from pansplat.images.cube_images import CubeImage, write_cube
-from pansplat.inputs.pairs import Link, Note, Panorama, find_mask
+from pansplat.images.cube_images import MAX_SIZE, CubeImage, CubeLevel, write_cube
+from pansplat.inputs.panorama_sets import Link, Note, Panorama, find_mask
 from pansplat.inputs.stated_files import locate_inside
 from pansplat.system.files import make_portable_name, make_unique_name, read_file
 from pansplat.system.strict_json import convert
@@ -131,6 +131,26 @@ def require_tiles(face: int, tile: int) -> None:
         raise InputError(
             f"needed at most {_MAX_TILES} x {_MAX_TILES} tiles a face, got {face} pixels in tiles of {tile}"
         )
+
+
+def require_levels(what: str, levels: Sequence[CubeLevel], gap: str | None, largest: int) -> tuple[CubeLevel, ...]:
+    """The complete levels of a panorama, at least one. Warns if a larger one is stated.
+
+    Args:
+        what: the panorama, for messages.
+        levels: the smallest first.
+        gap: what another level lacks, in words.
+        largest: stated size, pixels.
+    """
+    if not levels:
+        raise InputError(f"needed all tiles of a level, but {gap or 'there is none'}; copy or export the tour again")
+    largest = min(largest, MAX_SIZE)
+    if levels[-1].size < largest:
+        size = levels[-1].size
+        warnings.warn(
+            f"{what} is read at {size} instead of {largest} pixels a face: {gap}.", InputWarning, stacklevel=4
+        )
+    return tuple(levels)
 
 
 def plain_text(value: Any) -> str:

@@ -12,15 +12,14 @@ src/views/Rectilinear.js (angles), demos/sample-tour/index.js.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pansplat.errors import InputError, InputWarning
-from pansplat.images.cube_faces import find_gap
+from pansplat.errors import InputError
+from pansplat.images.cube_faces import find_gap, keep_complete
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.web_tours.entries import (
     Entry,
     Pixels,
@@ -33,6 +32,7 @@ from pansplat.inputs.web_tours.entries import (
     read_note,
     read_spots,
     read_text,
+    require_levels,
     require_tiles,
 )
 from pansplat.inputs.web_tours.javascript import parse_literal
@@ -113,37 +113,18 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
     ]
     for pixels, tile in stated:
         require_tiles(min(pixels, MAX_SIZE), tile)
-    attempts = [_find_complete(base, stated, first, folder) for first in (0, 1)]
+    attempts = [keep_complete(_list_levels(base, stated, first, folder), folder) for first in (0, 1)]
     best, gap = max(attempts, key=lambda attempt: len(attempt[0]))
-    gap = gap or f"{base} is missing"
-    if not best:
-        raise InputError(f"needed all tiles of a level, but {gap}; copy or export the tour again")
-    largest = min(max(pixels for pixels, _ in stated), MAX_SIZE) if stated else 0
-    if best[-1].size < largest:
-        warnings.warn(
-            f"{source}: scene {key!r} is read at {best[-1].size} instead of {largest} pixels a face: {gap}.",
-            category=InputWarning,
-            stacklevel=4,
-        )
-    return tuple(best)
+    largest = max((pixels for pixels, _ in stated), default=0)
+    return require_levels(f"{source}: scene {key!r}", best, gap or f"{base} is missing", largest)
 
 
-def _find_complete(
-    base: str, stated: Sequence[tuple[int, int]], first: int, folder: Path
-) -> tuple[list[CubeLevel], str | None]:
-    """The complete levels, the smallest first, and a gap of the others, if the levels count from `first`."""
-    complete: list[CubeLevel] = []
-    found = None
+def _list_levels(base: str, stated: Sequence[tuple[int, int]], first: int, folder: Path) -> Iterator[CubeLevel]:
+    """The levels if they count from `first`, without a level 0 that is in preview.jpg only."""
     for place, (pixels, tile) in enumerate(stated, start=first):
         level = CubeLevel(pixels, tile, tuple(f"{base}/{place}/{face}/{ROW}/{COLUMN}.jpg" for face in _FACES))
-        if pixels > MAX_SIZE or _has_more_tiles(level, folder):
-            continue
-        gap = find_gap(level, folder)
-        if gap is None:
-            complete.append(level)
-        elif place:
-            found = gap
-    return sorted(complete, key=lambda level: level.size), found
+        if not _has_more_tiles(level, folder) and (place or find_gap(level, folder) is None):
+            yield level
 
 
 def _has_more_tiles(level: CubeLevel, folder: Path) -> bool:

@@ -13,18 +13,17 @@ from __future__ import annotations
 import html
 import math
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
 
-from pansplat.errors import InputError, InputWarning
-from pansplat.images.cube_faces import find_gap, require_faces
+from pansplat.errors import InputError
+from pansplat.images.cube_faces import keep_complete, require_faces
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
 from pansplat.images.image_files import require_panorama
-from pansplat.inputs.pairs import Link, Note
+from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.web_tours.entries import (
     MAX_BYTES,
     Entry,
@@ -39,9 +38,10 @@ from pansplat.inputs.web_tours.entries import (
     read_note,
     read_spots,
     read_text,
+    require_levels,
     require_tiles,
 )
-from pansplat.inputs.web_tours.javascript import parse_literal, skip_space
+from pansplat.inputs.web_tours.javascript import parse_literal
 from pansplat.system.strict_json import convert
 
 SUFFIXES = (".json", ".html", ".htm", ".js")
@@ -102,10 +102,9 @@ def _find_configuration(source: Path) -> dict[str, Any] | None:
     """The configuration in a file; None if there is none."""
     text = read_text(source)
     if source.suffix.lower() == ".json":
-        start = len(text) - len(text.lstrip())
-        if not text.startswith("{", start) or not any(key in text for key in ("scenes", *_PICTURES)):
+        if not text.lstrip().startswith("{") or not any(key in text for key in ("scenes", *_PICTURES)):
             return None
-        return _accept(parse_literal(text, start, source)[0])
+        return _accept(parse_literal(text, 0, source)[0])
     return next((literal for literal in _list_arguments(text, source) if _accept(literal) is not None), None)
 
 
@@ -115,7 +114,7 @@ def _list_arguments(text: str, source: Path) -> Iterator[Any]:
     while (call := _CALL.search(text, position)) is not None:
         _, position = parse_literal(text, call.end(), source)
         if text.startswith(",", position):
-            value, position = parse_literal(text, skip_space(text, position + 1), source)
+            value, position = parse_literal(text, position + 1, source)
             yield value
 
 
@@ -193,35 +192,15 @@ def _read_tiles(scene: Mapping[str, Any], folder: Path) -> CubeImage:
     kinds = {"tileResolution": Pixels, "cubeResolution": Pixels, "maxLevel": Annotated[int, Meta(ge=1, le=_MAX_LEVEL)]}
     tile, full, highest = (convert(stated.get(name), kind, name, strict=False) for name, kind in kinds.items())
     require_tiles(min(full, MAX_SIZE), tile)
-    levels: list[CubeLevel] = []
-    gaps: list[str] = []
-    for number in range(1, highest + 1):
-        pixels = full >> (highest - number)
-        faces = _fill(folder, base, stated.get("path"), suffix, {"%l": str(number), "%y": ROW, "%x": COLUMN})
-        if not 0 < pixels <= MAX_SIZE:
-            continue
-        level = CubeLevel(pixels, tile, faces)
-        gap = find_gap(level, folder)
-        if gap is None:
-            levels.append(level)
-        else:
-            gaps.append(gap)
+    sizes = {number: full >> (highest - number) for number in range(1, highest + 1)}
+    faces = {n: _fill(folder, base, stated.get("path"), suffix, {"%l": str(n), "%y": ROW, "%x": COLUMN}) for n in sizes}
+    levels, gap = keep_complete((CubeLevel(sizes[number], tile, faces[number]) for number in sizes), folder)
     if stated.get("fallbackPath") and not levels:
-        faces = _fill(folder, base, stated["fallbackPath"], suffix, {})
-        if all((folder / face).is_file() for face in faces):
-            pixels = require_faces([folder / face for face in faces])
-            levels.append(CubeLevel(pixels, pixels, faces))
-    if not levels:
-        raise InputError(
-            f"needed all tiles of a level, but {gaps[-1] if gaps else 'there is none'}; copy the tour again"
-        )
-    if gaps and levels[-1].size < min(full, MAX_SIZE):
-        warnings.warn(
-            f"{folder}/{gaps[-1]}; the panorama is read at {levels[-1].size} pixels a face, not {full}.",
-            category=InputWarning,
-            stacklevel=4,
-        )
-    return CubeImage(folder, tuple(levels))
+        files = _fill(folder, base, stated["fallbackPath"], suffix, {})
+        if all((folder / file).is_file() for file in files):
+            pixels = require_faces([folder / file for file in files])
+            levels.append(CubeLevel(pixels, pixels, files))
+    return CubeImage(folder, require_levels(f"{folder}: the panorama", levels, gap, full))
 
 
 def _fill(folder: Path, base: list[Any], pattern: Any, suffix: str, values: Mapping[str, str]) -> tuple[str, ...]:

@@ -48,8 +48,6 @@ _PREFETCH_AHEAD = 16  # Gaussians between the prefetch of a row and its use
 _GEOMETRY = 11  # numbers of a row before the harmonics: mean, opacity, quaternion, scales
 _LINE_SIZE = 16  # float32 numbers in a cache line
 _ROWS_PER_ITEM = 16
-# One selection serves a camera that moves within these margins; wider ones select less often and project more.
-_MARGIN_METRES, _MARGIN_RADIANS = 0.15, 0.06
 _EVEN_BYTES = np.uint32(0x00FF00FF)
 _FRACTION_BITS = 8  # bits of the weight of a neighbouring pixel, after the binary point
 
@@ -67,52 +65,11 @@ class Selection(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Selected:
-    """The Gaussians of a widened selection.
-
-    Attributes:
-        scene, labels, num_layers: from which they were selected.
-        position: camera centre.
-        selection: without the widening.
-        gaussians, ends: of `DisplayScene._select`.
-        workspace: their memory.
-    """
-
-    scene: "DisplayScene"
-    labels: Int[np.ndarray, "n"]
-    num_layers: int
-    position: Float[np.ndarray, "3"]
-    selection: Selection
-    gaussians: GaussianArrays
-    ends: list[int]
-    workspace: Workspace
-
-    def contains(
-        self, scene: "DisplayScene", position: np.ndarray, labels: np.ndarray, num_layers: int, selection: Selection
-    ) -> bool:
-        """Whether all Gaussians in view from another camera are among these."""
-        return (
-            (self.scene is scene and self.labels is labels and self.num_layers == num_layers)
-            and self.selection.deviation >= selection.deviation
-            and self.selection.normals.shape == selection.normals.shape
-            and float(np.linalg.norm(position - self.position)) <= _MARGIN_METRES
-            and float(np.linalg.norm(selection.normals - self.selection.normals, axis=1).max()) <= _MARGIN_RADIANS
-        )
-
-
-class SelectionCache:
-    """Gaussians that are selected for a view and a little around it, and serve the next views of a moving camera."""
-
-    def __init__(self) -> None:
-        self.selected: _Selected | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Layers:
     """The layers of one image plane before background and normalisation.
 
     Attributes:
-        sums: of weight x (RGB, radial distance, 1), for each layer.
+        sums: sums of weight x (RGB, radial distance, 1), for each layer.
         selected: Gaussians in view.
         statistics: counts and seconds by stage.
     """
@@ -190,7 +147,6 @@ class DisplayScene:
         near: float,
         *,
         selection: Selection | None = None,
-        cache: SelectionCache | None = None,
         min_transmittance: float = MIN_TRANSMITTANCE,
         shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> Layers:
@@ -203,7 +159,6 @@ class DisplayScene:
             num_layers: number of layers.
             near: Gaussians whose mean is nearer are not drawn, metres.
             selection: leaves out Gaussians that are not in view.
-            cache: has the Gaussians of earlier views; written if they do not serve this one.
             min_transmittance: a pixel is finished at this transmittance or below.
             shift: see `project_gaussians`.
         """
@@ -216,14 +171,7 @@ class DisplayScene:
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
         with announce_compilation():
             with statistics.timed("select"):
-                of_view = camera.pose[:3, 3], labels, num_layers, selection
-                if cache is None or selection is None:
-                    gaussians, ends = self._select(*of_view, workspace)
-                else:
-                    if cache.selected is None or not cache.selected.contains(self, *of_view):
-                        cache.selected = None  # its memory is reused
-                        cache.selected = self._select_around(*of_view)
-                    gaussians, ends = cache.selected.gaussians, cache.selected.ends
+                gaussians, ends = self._select(camera.pose[:3, 3], labels, num_layers, selection, workspace)
             with statistics.timed("project"):
                 projected = project_gaussians(gaussians, camera, workspace, threads, shift)
             start = 0
@@ -236,20 +184,6 @@ class DisplayScene:
                 start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)
 
-    def _select_around(
-        self, position: np.ndarray, labels: np.ndarray, num_layers: int, selection: Selection
-    ) -> _Selected:
-        """Copy the Gaussians in view of all cameras within the margins.
-
-        With the distance d to the first camera, a side with normal n moves towards a centre by at most the metres plus
-        d times the radians. The Gaussian's widening by the filter grows with the metres, too.
-        """
-        workspace = Workspace()
-        growth = 1 + 1.001 * selection.deviation * float(self._balls[4].max(initial=0)) + 1e-5
-        margins = 1.001 * growth * _MARGIN_METRES, 1.001 * _MARGIN_RADIANS
-        found = self._select(position, labels, num_layers, selection, workspace, margins)
-        return _Selected(self, labels, num_layers, position.copy(), selection, *found, workspace)
-
     def _select(
         self,
         position: np.ndarray,
@@ -257,13 +191,9 @@ class DisplayScene:
         num_layers: int,
         selection: Selection | None,
         workspace: Workspace,
-        margins: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[GaussianArrays, list[int]]:
-        """Copy the Gaussians in view, layer by layer in index order; returns them and the end of each layer.
-
-        `margins` move the sides of the cone outwards, by metres and by radians.
-        """
-        edges, marks, counts = mark_in_view(self._balls, position, selection, labels, num_layers, margins)
+        """Copy the Gaussians in view, layer by layer in index order; returns them and the end of each layer."""
+        edges, marks, counts = mark_in_view(self._balls, position, selection, labels, num_layers)
         ends = np.cumsum(counts.sum(axis=0))
         positions = ends - counts.sum(axis=0) + np.cumsum(counts, axis=0) - counts
         total, coefficients = int(counts.sum()), self._num_coefficients
@@ -282,7 +212,6 @@ def mark_in_view(
     selection: Selection | None,
     labels: Int[np.ndarray, "label"],
     num_layers: int = 1,
-    margins: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Int[np.ndarray, "edge"], Int[np.ndarray, "n"], Int[np.ndarray, "part layer"]]:
     """Frustum culling: the layer of each Gaussian that may be in view, else `NO_LAYER`; conservative.
 
@@ -291,7 +220,6 @@ def mark_in_view(
         position: camera centre.
         selection: the cone in view; None keeps all Gaussians.
         labels: layer of each Gaussian, int16, or `NO_LAYER`.
-        margins: by which the sides of the cone move outwards, in metres and in radians.
 
     Returns:
         Ends of parts of the scene, the layers (int16), and the number of Gaussians of each part and layer.
@@ -303,17 +231,17 @@ def mark_in_view(
     edges = np.linspace(0, num, parts + 1).astype(np.int64)
     marks, counts = pooled_empty(num, np.int16), np.zeros((parts, num_layers), np.int64)
     normals, deviation = selection or (np.zeros((0, 3)), 0.0)
-    offsets = normals @ position - margins[0]
+    offsets = normals @ position
     mark = partial(
         _mark_in_view, edges, balls, position.astype(np.float32), np.ascontiguousarray(normals, np.float32),
-        offsets.astype(np.float32), np.float32(1.001 * deviation), np.float32(1e-5 + margins[1]), labels, marks, counts,
+        offsets.astype(np.float32), np.float32(1.001 * deviation), labels, marks, counts,
     )  # fmt: skip
     parallel_for(mark, parts, threads)
     return edges, marks, counts
 
 
 @kernel
-def _mark_in_view(edges, balls, position, normals, offsets, deviation, slack, labels, marks, counts, part):
+def _mark_in_view(edges, balls, position, normals, offsets, deviation, labels, marks, counts, part):
     """Write the layer of each Gaussian that is in view, else NO_LAYER, and count the Gaussians of each layer."""
     x, y, z, extent, reach = balls[0], balls[1], balls[2], balls[3], balls[4]
     p_x, p_y, p_z = position[0], position[1], position[2]
@@ -327,7 +255,7 @@ def _mark_in_view(edges, balls, position, normals, offsets, deviation, slack, la
                 load_scalar(z, first + i) - p_z,
             )
             distance = math.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
-            bound = distance * (deviation * load_scalar(reach, first + i) + slack)
+            bound = distance * (deviation * load_scalar(reach, first + i) + np.float32(1e-5))
             store_scalar(bounds, i, bound + np.float32(1.001) * load_scalar(extent, first + i))
             store_scalar(seen, i, np.float32(0) if load_scalar(reach, first + i) > np.float32(0) else -np.float32(1))
         for k in range(normals.shape[0]):
@@ -488,7 +416,7 @@ class PixelFaces:
 
         Args:
             rotation: camera to world.
-            focal: of the image, pixels.
+            focal: focal length of the image, pixels.
             pixels: written.
             bottom_up: write the bottom row first, as OpenGL stores images.
         """
@@ -506,7 +434,7 @@ def _sample_rows(faces, face_focal, focal, to_faces, bottom_up, pixels, item):
     Args:
         faces: pixels.
         face_focal: focal length of the faces.
-        focal: of the image.
+        focal: focal length of the image.
         to_faces: (face, 3, 3) float64, from camera axes to each face's axes.
         bottom_up: write the bottom row first.
         pixels: written.

@@ -8,19 +8,7 @@ import math
 
 import numpy as np
 
-from pansplat.rendering.cpu.simd import (
-    LANES,
-    broadcast,
-    load_aos3,
-    load_aos4,
-    load_row,
-    load_scalar,
-    multiply_add,
-    select,
-    store_aos3,
-    store_aos4,
-    to_f32,
-)
+from pansplat.rendering.cpu.simd import load_scalar
 from pansplat.system.kernels import inline_kernel
 
 _C0 = 0.5 / math.sqrt(math.pi)
@@ -141,10 +129,8 @@ def accumulate_direction_gradients(rows, direction_row, num, view_dependent, gra
 @inline_kernel
 def evaluate_colors(harmonics, start, count, basis, view_dependent, rows, radius_row, values):
     """Write the colour max(0, 0.5 + sum_k Y_k c_k) and the radius of `count` Gaussians from `start` on into values."""
-    zero, done = np.float32(0), 0
-    if view_dependent is None:
-        done = _evaluate_constant_colors(harmonics, start, count, rows, radius_row, values)
-    for i in range(done, count):
+    zero = np.float32(0)
+    for i in range(count):
         g = start + i
         red, green, blue = np.float32(0.5), np.float32(0.5), np.float32(0.5)
         for k in range(harmonics.shape[1]):
@@ -157,20 +143,6 @@ def evaluate_colors(harmonics, start, count, basis, view_dependent, rows, radius
 
 
 @inline_kernel
-def _evaluate_constant_colors(harmonics, start, count, rows, radius_row, values):
-    """Write the colours and radii of whole vectors of Gaussians with one harmonic; return their number."""
-    weight, half, zero = broadcast(np.float32(_C0)), broadcast(np.float32(0.5)), broadcast(np.float32(0))
-    coefficients, written, whole = harmonics.reshape(-1), values.reshape(-1), count // LANES * LANES
-    for i in range(0, whole, LANES):
-        red, green, blue = load_aos3(coefficients, 3 * (start + i))
-        red = max(multiply_add(weight, red, half), zero)
-        green = max(multiply_add(weight, green, half), zero)
-        blue = max(multiply_add(weight, blue, half), zero)
-        store_aos4(written, 4 * (start + i), red, green, blue, to_f32(load_row(rows, radius_row, i)))
-    return whole
-
-
-@inline_kernel
 def backpropagate_colors(harmonics, start, kept, basis, values, grad_values, grad_harmonics, grad_basis):
     """Write the gradients of coefficients and harmonics, given those of a block's colours.
 
@@ -178,7 +150,7 @@ def backpropagate_colors(harmonics, start, kept, basis, values, grad_values, gra
         start: the block's first Gaussian.
         kept: false for culled Gaussians, whose gradients are 0, whether or not their coefficients are finite.
         values: colours of the forward; a channel at 0 has no gradient.
-        grad_values: of colours and radius, flat.
+        grad_values: gradients of colours and radius, flat.
         grad_harmonics: no rows if not needed.
         grad_basis: written, a row per harmonic.
     """
@@ -201,30 +173,3 @@ def backpropagate_colors(harmonics, start, kept, basis, values, grad_values, gra
                 if needed:
                     grad_harmonics[g, k, c] = weight * grad_color[c]
             grad_basis[k, i] = total
-
-
-@inline_kernel
-def backpropagate_constant_colors(start, count, values, grad_values, grad_harmonics):
-    """Write the gradients of the coefficients of one harmonic, given those of the colours.
-
-    Args:
-        values: colours of the forward; a channel at 0 has no gradient.
-        grad_values: of colours and radius, flat.
-        grad_harmonics: no rows if not needed.
-    """
-    if grad_harmonics.shape[0] == 0:
-        return
-    whole, weight = count // LANES * LANES, np.float32(_C0)
-    factor, zero = broadcast(weight), broadcast(np.float32(0))
-    forward, written = values.reshape(-1), grad_harmonics.reshape(-1)
-    for i in range(0, whole, LANES):
-        grad_red, grad_green, grad_blue, _ = load_aos4(grad_values, 4 * i)
-        red, green, blue, _ = load_aos4(forward, 4 * (start + i))
-        grad_red = select(red > zero, factor * grad_red, zero)
-        grad_green = select(green > zero, factor * grad_green, zero)
-        grad_blue = select(blue > zero, factor * grad_blue, zero)
-        store_aos3(written, 3 * (start + i), grad_red, grad_green, grad_blue)
-    for i in range(whole, count):
-        for c in range(3):
-            grad = weight * load_scalar(grad_values, 4 * i + c)
-            grad_harmonics[start + i, 0, c] = grad if values[start + i, c] > 0 else np.float32(0)

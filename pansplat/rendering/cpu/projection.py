@@ -25,16 +25,9 @@ from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.harmonics import evaluate_basis, evaluate_colors
 from pansplat.rendering.cpu.simd import (
     LANES,
-    PREFETCH_DISTANCE,
-    align_stack,
-    any_magnitude_reaches,
-    aos1_to_soa,
-    aos3_to_soa,
-    aos4_to_soa,
     broadcast,
     load_row,
     mantissa_and_exponent,
-    prefetch,
     select,
     soa_to_records,
     store,
@@ -49,8 +42,6 @@ from pansplat.system.kernels import Workspace, inline_kernel, kernel, parallel_f
 GAUSSIAN_BLOCK = 64
 GAUSSIANS_PER_ITEM = 8192
 CULLED = -128.0  # log2_peak that marks a Gaussian as culled
-
-_MAX_MAGNITUDE_BITS = np.uint32(2 * int(np.float32(MAX_MAGNITUDE).view(np.uint32)))  # the sign is shifted out
 
 # Rows of a block: inputs and results.
 MEAN_ROW, SHAPE_ROW, OPACITY_ROW = 0, 3, 10  # the shape is a quaternion and three scales
@@ -125,14 +116,14 @@ def project_gaussians(
     """Project all Gaussians; the arrays belong to the workspace.
 
     Args:
-        shift: of the camera during the exposure, metres, axes of the means: Gaussians blur along it.
+        shift: movement of the camera during the exposure, metres, axes of the means: Gaussians blur along it.
     """
     num = len(gaussians.means)
     records, radii = workspace.array((num, layout.RECORD_SIZE), np.float32), workspace.array(num, np.float64)
     values, kept = workspace.array((num, 4), np.float32), workspace.array(num, np.uint8)
-    harmonic_bits = gaussians.harmonics.reshape(-1).view(np.uint32)
+    coefficients = gaussians.harmonics.reshape(num, 3 * gaussians.harmonics.shape[1])
     work = partial(
-        _project_gaussians, *gaussians, harmonic_bits, *camera, np.array(shift) / math.sqrt(12),
+        _project_gaussians, *gaussians, coefficients, *camera, np.array(shift) / math.sqrt(12),
         gaussians.view_dependent, records.reshape(-1), values, radii, kept,
     )  # fmt: skip
     parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
@@ -141,19 +132,16 @@ def project_gaussians(
 
 @kernel
 def _project_gaussians(
-    means, quats, scales, opacities, harmonics, harmonic_bits,
+    means, quats, scales, opacities, harmonics, coefficients,
     pose, filter_variance, near, shift, view_dependent, records, values, radii, kept, item,
 ):  # fmt: skip
-    align_stack()
     rows, block_kept = np.ones((NUM_ROWS, GAUSSIAN_BLOCK)), np.empty(GAUSSIAN_BLOCK, np.uint8)
     basis, soa = np.empty((25, GAUSSIAN_BLOCK), np.float32), np.empty(layout.RECORD_SIZE * LANES, np.float32)
     camera, motion = pose_columns(pose), (shift[0], shift[1], shift[2])
     for start in range(item * GAUSSIANS_PER_ITEM, min((item + 1) * GAUSSIANS_PER_ITEM, means.shape[0]), GAUSSIAN_BLOCK):
         count = min(GAUSSIAN_BLOCK, means.shape[0] - start)
-        may_be_invalid = load_block(means, quats, scales, opacities, start, count, rows)
-        _validate_harmonics(harmonic_bits, 3 * harmonics.shape[1], start, count, rows)
-        if may_be_invalid:
-            _invalidate_large_numbers(rows, MEAN_ROW, OPACITY_ROW + 1, count)
+        load_block(means, quats, scales, opacities, start, count, rows)
+        _mark_usable(coefficients, start, count, rows)
         for i in range(0, count, LANES):
             store_mask(block_kept, i, _compute_records(camera, motion, filter_variance, near, rows, i, soa))
             soa_to_records(soa, LANES, start + i, min(LANES, count - i), records)
@@ -216,41 +204,33 @@ def _log2(value):
 
 @inline_kernel
 def load_block(means, quats, scales, opacities, start, count, rows):
-    """Load the fields of `count` Gaussians from `start` on into rows; return whether a number may be unusable."""
-    largest = broadcast(np.float32(0))
-    largest = aos3_to_soa(means.reshape(-1), start, count, rows, MEAN_ROW, largest)
-    largest = aos1_to_soa(opacities, start, count, rows, OPACITY_ROW, largest)
-    largest = aos4_to_soa(quats.reshape(-1), start, count, rows, SHAPE_ROW, largest)
-    largest = aos3_to_soa(scales.reshape(-1), start, count, rows, SHAPE_ROW + 4, largest)
-    return count % LANES > 0 or any_magnitude_reaches(largest, _MAX_MAGNITUDE_BITS)
+    """Load the fields of `count` Gaussians from `start` on into rows."""
+    for i in range(count):
+        for axis in range(3):
+            rows[MEAN_ROW + axis, i] = means[start + i, axis]
+            rows[SHAPE_ROW + 4 + axis, i] = scales[start + i, axis]
+        for axis in range(4):
+            rows[SHAPE_ROW + axis, i] = quats[start + i, axis]
+        rows[OPACITY_ROW, i] = opacities[start + i]
 
 
 @inline_kernel
-def _invalidate_large_numbers(rows, first, end, count):
-    """Mark Gaussians as invalid if a number in these rows is not finite or too large."""
-    for row in range(first, end):
-        for i in range(count):
-            if not abs(rows[row, i]) < MAX_MAGNITUDE:
-                rows[VALID_ROW, i] = 0.0
+def _mark_usable(coefficients, start, count, rows):
+    """Mark the Gaussians of a block as valid if all their numbers are finite and small enough.
 
-
-@inline_kernel
-def _validate_harmonics(harmonic_bits, size, start, count, rows):
-    """Mark Gaussians as valid, or as invalid if one of their `size` coefficients is not finite or too large."""
+    Args:
+        coefficients: (n, numbers), the harmonics.
+    """
     for i in range(GAUSSIAN_BLOCK):
         rows[VALID_ROW, i] = 1.0
-    largest = np.uint32(0)
-    for j in range(0, size * count, 2 * LANES):
-        prefetch(harmonic_bits, size * (start + PREFETCH_DISTANCE) + j)
-    block = harmonic_bits[start * size : (start + count) * size]
-    for j in range(block.shape[0]):
-        bits = np.uint32(block[j] << np.uint32(1))  # this shifts out the sign
-        largest = bits if bits > largest else largest
-    if largest < _MAX_MAGNITUDE_BITS:
-        return
-    for j in range(block.shape[0]):
-        if np.uint32(block[j] << np.uint32(1)) >= _MAX_MAGNITUDE_BITS:
-            rows[VALID_ROW, j // size] = 0.0
+    for row in range(MEAN_ROW, OPACITY_ROW + 1):
+        for i in range(count):
+            rows[VALID_ROW, i] *= abs(rows[row, i]) < MAX_MAGNITUDE
+    for i in range(count):
+        usable = True
+        for j in range(coefficients.shape[1]):
+            usable &= abs(coefficients[start + i, j]) < MAX_MAGNITUDE
+        rows[VALID_ROW, i] *= usable
 
 
 # --- direction, frame and covariance of eight Gaussians ---

@@ -1,4 +1,4 @@
-"""Gradients of stage one: of the Gaussians and the camera's pose, from those of records and values.
+"""Gradients of stage one: from those of records and values to those of the Gaussians and of the camera's pose.
 
 Source: docs/rendering.md, sections 1 to 3, differentiated by hand. Rotating the rows a and b together about n does not
 change an image, so their derivatives may differ by such a rotation; these are the symmetric ones. With p the axis dual
@@ -22,12 +22,7 @@ import numpy as np
 
 from pansplat.constants import MIN_COMPENSATION
 from pansplat.rendering.cpu import records as layout
-from pansplat.rendering.cpu.harmonics import (
-    accumulate_direction_gradients,
-    backpropagate_colors,
-    backpropagate_constant_colors,
-    evaluate_basis,
-)
+from pansplat.rendering.cpu.harmonics import accumulate_direction_gradients, backpropagate_colors, evaluate_basis
 from pansplat.rendering.cpu.projection import (
     DIRECTION_ROW,
     GAUSSIAN_BLOCK,
@@ -55,26 +50,21 @@ from pansplat.rendering.cpu.projection import (
 )
 from pansplat.rendering.cpu.simd import (
     LANES,
-    PREFETCH_DISTANCE,
-    align_stack,
     broadcast,
     load,
-    load_aos4,
     load_four,
     load_row,
     load_scalar,
     prefetch,
     records_to_soa,
     select,
-    soa_to_aos1,
-    soa_to_aos3,
-    soa_to_aos4,
     store,
     store_row,
     to_f64,
 )
 from pansplat.system.kernels import inline_kernel, kernel, parallel_for
 
+_SLOTS_AHEAD = 32  # slots between the prefetch of a gradient and its use
 _POSE_SIZE = 12  # entries of a pose: its rotation and its centre, by rows
 
 # Rows of a block, after those of projection.py. All are gradients.
@@ -146,7 +136,6 @@ def _backpropagate_projection(
     view_dependent, scene_kept, values, grad_records, grad_values, offsets,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_harmonics, pose_sums, item,
 ):  # fmt: skip
-    align_stack()
     rows, camera = np.ones((_NUM_ROWS, GAUSSIAN_BLOCK)), pose_columns(pose)
     grad_pose = np.zeros((_POSE_SIZE if pose_sums.shape[0] > 0 else 0, LANES))
     record_sums = np.zeros(GAUSSIAN_BLOCK * layout.RECORD_SIZE, np.float32)
@@ -161,14 +150,11 @@ def _backpropagate_projection(
         _clear_culled(scene_kept, start, count, pose, rows, soa, kept)
         for i in range(0, GAUSSIAN_BLOCK, LANES):
             _backpropagate_records(camera, filter_variance, rows, soa.reshape(-1), grad_pose, i)
-        if view_dependent is None:
-            backpropagate_constant_colors(start, count, values, value_sums, grad_harmonics)
-        else:
-            evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
-            backpropagate_colors(harmonics, start, kept, basis, values, value_sums, grad_harmonics, grad_basis)
-            accumulate_direction_gradients(
-                rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, grad_basis, _MEAN_GRAD_ROW
-            )
+        evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
+        backpropagate_colors(harmonics, start, kept, basis, values, value_sums, grad_harmonics, grad_basis)
+        accumulate_direction_gradients(
+            rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, grad_basis, _MEAN_GRAD_ROW
+        )
         _backpropagate_means(rows, grad_pose)
         _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_opacities)
     for j in range(grad_pose.shape[0]):
@@ -194,8 +180,8 @@ def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, va
     for i in range(count):
         first, end = load_scalar(offsets, start + i), load_scalar(offsets, start + i + 1)
         low, high, values = zero, zero, zero
-        prefetch(grad_records, layout.RECORD_SIZE * (first + PREFETCH_DISTANCE // 4))
-        prefetch(grad_values, 4 * (first + PREFETCH_DISTANCE // 4))
+        prefetch(grad_records, layout.RECORD_SIZE * (first + _SLOTS_AHEAD))
+        prefetch(grad_values, 4 * (first + _SLOTS_AHEAD))
         for slot in range(first, end):  # one loop, so that its end is mispredicted once
             low = low + load(grad_records, layout.RECORD_SIZE * slot)
             high = high + load(grad_records, layout.RECORD_SIZE * slot + LANES)
@@ -203,8 +189,8 @@ def _sum_slots(grad_records, grad_values, offsets, start, count, record_sums, va
         store(value_sums, 4 * i, values)
         store(record_sums, layout.RECORD_SIZE * i, low)
         store(record_sums, layout.RECORD_SIZE * i + LANES, high)
-    for i in range(0, GAUSSIAN_BLOCK, LANES):
-        store_row(rows, _RADIUS_GRAD_ROW, i, to_f64(load_aos4(value_sums, 4 * i)[3]))
+    for i in range(GAUSSIAN_BLOCK):
+        rows[_RADIUS_GRAD_ROW, i] = value_sums[4 * i + 3]
 
 
 @inline_kernel
@@ -405,10 +391,18 @@ def _backpropagate_means(rows, grad_pose):
 @inline_kernel
 def _write_gradients(rows, start, count, grad_means, grad_quats, grad_scales, grad_opacities):
     if grad_means.shape[0] > 0:
-        soa_to_aos3(rows, _MEAN_GRAD_ROW, start, count, grad_means.reshape(-1))
+        _copy_rows(rows, _MEAN_GRAD_ROW, start, count, grad_means)
     if grad_opacities.shape[0] > 0:
-        soa_to_aos1(rows, OPACITY_ROW, start, count, grad_opacities)
+        _copy_rows(rows, OPACITY_ROW, start, count, grad_opacities.reshape(-1, 1))
     if grad_quats.shape[0] > 0:
-        soa_to_aos4(rows, _SHAPE_GRAD_ROW, start, count, grad_quats.reshape(-1))
+        _copy_rows(rows, _SHAPE_GRAD_ROW, start, count, grad_quats)
     if grad_scales.shape[0] > 0:
-        soa_to_aos3(rows, _SHAPE_GRAD_ROW + 4, start, count, grad_scales.reshape(-1))
+        _copy_rows(rows, _SHAPE_GRAD_ROW + 4, start, count, grad_scales)
+
+
+@inline_kernel
+def _copy_rows(rows, row, start, count, columns):
+    """Copy rows of a block to the columns of an array, rounded to float32."""
+    for i in range(count):
+        for j in range(columns.shape[1]):
+            columns[start + i, j] = np.float32(rows[row + j, i])

@@ -20,21 +20,13 @@ import numpy.typing as npt
 
 from pansplat.constants import ALPHA_CUT, MAX_ALPHA, TRANSMITTANCE_CUT
 from pansplat.rendering.cpu.projection import dot, tangent_frame
-from pansplat.rendering.cpu.records import (
-    BLOCK_WIDTH,
-    COLUMN_RAYS,
-    EQUIRECT_RAYS,
-    RECORD_SIZE,
-    TILE_SIZE,
-    PixelTables,
-)
+from pansplat.rendering.cpu.records import BLOCK_WIDTH, COLUMN_RAYS, EQUIRECT_RAYS, RECORD_SIZE, TILE_SIZE, PixelTables
 from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
     broadcast,
     copy_four,
     exp2,
-    join_halves,
     list_set_bits,
     load,
     load_broadcast,
@@ -117,7 +109,7 @@ def set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame):
     """Set a tile's centre and axes.
 
     Args:
-        kind, columns, rows, rotation: of the PixelTables.
+        kind, columns, rows, rotation: fields of the PixelTables.
         left, top: pixel at the tile's corner.
         centre: (3) float64, written.
         frame: (TILE_FRAME_SIZE), written: the centre as float32, its residual, two axes across, and the centre again as
@@ -217,7 +209,7 @@ def load_chunk(records, values, intersections, first, count, frame, is_3d, footp
         records, intersections: flat.
         values: (n, VALUE_LANES).
         first, count: the chunk's intersections.
-        frame: of the tile.
+        frame: frame of the tile.
         is_3d: whether the tile needs three components.
         footprints: (FOOTPRINT_SIZE CHUNK_SIZE), written; past `count` the last Gaussian is repeated.
         chunk_values: (CHUNK_SIZE VALUE_LANES), written.
@@ -537,27 +529,6 @@ def _blend_values(block, count, log2_alphas, indices, begin, chunk_values, trans
 @inline_kernel_no_refcount
 def _write_tile(transmittance, tile_sums, sums, left, top):
     """Copy a tile's sums into the image; the last one is the sum of the weights, 1 minus the transmittance."""
-    width, height = sums.shape[2], sums.shape[1]
-    if left + TILE_SIZE > width or top + TILE_SIZE > height:
-        _write_partial_tile(transmittance, tile_sums, sums, left, top)
-        return
-    image, one = sums.reshape(-1), broadcast(np.float32(1))
-    for block in range(0, NUM_BLOCKS, 2):
-        pixel = block * LANES
-        corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
-        for channel in range(VALUE_LANES):
-            source, target = channel * TILE_PIXELS + pixel, channel * height * width + corner
-            upper, lower = join_halves(load(tile_sums, source), load(tile_sums, source + LANES))
-            store(image, target, upper)
-            store(image, target + width, lower)
-        target = VALUE_LANES * height * width + corner
-        upper, lower = join_halves(one - load(transmittance, pixel), one - load(transmittance, pixel + LANES))
-        store(image, target, upper)
-        store(image, target + width, lower)
-
-
-@inline_kernel_no_refcount
-def _write_partial_tile(transmittance, tile_sums, sums, left, top):
     for pixel in range(TILE_PIXELS):
         x, y = image_position(pixel, left, top)
         if x < sums.shape[2] and y < sums.shape[1]:

@@ -1,4 +1,4 @@
-"""Gradients of stage three: of records and values, one slot per intersection, from the gradient of an image.
+"""Gradients of stage three: from that of an image to those of records and values, one slot per intersection.
 
 Source: docs/rendering.md, sections 3 and 4. The forward saved the transmittance before each chunk of a tile, so chunks
 are processed back to front, each with all its data in the L2 cache. In each block the weights are recomputed front to
@@ -17,9 +17,6 @@ import numpy as np
 
 from pansplat.constants import MAX_ALPHA
 from pansplat.rendering.cpu.rasterize import (
-    BLOCK_HEIGHT,
-    BLOCK_WIDTH,
-    BLOCKS_ACROSS,
     BUFFER_SIZE,
     CHUNK_SIZE,
     CHUNK_WORDS,
@@ -51,7 +48,6 @@ from pansplat.rendering.cpu.simd import (
     LANES,
     any_lane,
     broadcast,
-    join_halves,
     lane_sums,
     load,
     load_broadcast,
@@ -120,6 +116,7 @@ def _rasterize_tiles_backward(
     offsets, centre = np.empty(3 * TILE_PIXELS, np.float32), np.empty(3)
     frame = np.empty(TILE_FRAME_SIZE, np.float32)
     tile_grads, behind = np.empty((VALUE_LANES + 2) * TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+    tile_values = np.empty((VALUE_LANES + 1) * TILE_PIXELS, np.float32)
     footprints = np.empty(FOOTPRINT_SIZE * CHUNK_SIZE, np.float32)
     chunk_values = np.empty(VALUE_LANES * CHUNK_SIZE, np.float32)
     # `links` holds the block of each pair and the previous pair of the same Gaussian: a linked list from `heads` on.
@@ -133,7 +130,7 @@ def _rasterize_tiles_backward(
     for tile in range(low, high):
         left, top = (tile % tiles_across) * TILE_SIZE, (first_row + tile // tiles_across) * TILE_SIZE
         tile_is_3d, pixels_are_3d = set_tile_frame(kind, columns, rows, rotation, left, top, centre, frame), -1
-        _load_tile_gradients(sums, grad_sums, left, top, tile_grads)
+        _load_tile_gradients(sums, grad_sums, left, top, tile_grads, tile_values)
         begin, end, num_chunks = starts[tile], starts[tile + 1], saved_num_chunks[tile]
         _write_zeros(slots, begin + CHUNK_SIZE * num_chunks, end, grad_records, grad_values)
         for pixel in range(TILE_PIXELS):
@@ -163,51 +160,30 @@ def _rasterize_tiles_backward(
 
 
 @inline_kernel_no_refcount
-def _load_tile_gradients(sums, grad_sums, left, top, tile_grads):
+def _load_tile_gradients(sums, grad_sums, left, top, tile_grads, values):
     """Load a tile's gradients by blocks, 0 outside the image; then write two more rows.
 
     These are the gradient of the sum of the weights minus the dot product of gradients and sums, and this dot
     product. The weights and the final transmittance sum to 1, so a constant may be subtracted from the value of each
     Gaussian and of the background. With their mean as this constant, the differences are small.
+
+    Args:
+        values: scratch of (VALUE_LANES + 1) TILE_PIXELS numbers.
     """
-    height, width = grad_sums.shape[1], grad_sums.shape[2]
-    if left + TILE_SIZE > width or top + TILE_SIZE > height:
-        _load_partial_tile_gradients(sums, grad_sums, left, top, tile_grads)
-        return
-    image_grads, image = grad_sums.reshape(-1), sums.reshape(-1)
-    for block in range(0, NUM_BLOCKS, 2):
-        pixel, first, second = block * LANES, broadcast(np.float32(0)), broadcast(np.float32(0))
-        corner = (top + block // BLOCKS_ACROSS * BLOCK_HEIGHT) * width + left + block % BLOCKS_ACROSS * BLOCK_WIDTH
-        for channel in range(VALUE_LANES + 1):
-            at = channel * height * width + corner
-            gradient, next_gradient = join_halves(load(image_grads, at), load(image_grads, at + width))
-            value, next_value = join_halves(load(image, at), load(image, at + width))
-            first = multiply_add(gradient, value, first)
-            second = multiply_add(next_gradient, next_value, second)
-            row = channel * TILE_PIXELS + pixel
-            store(tile_grads, row, gradient)
-            store(tile_grads, row + LANES, next_gradient)
-        row = VALUE_LANES * TILE_PIXELS + pixel
-        store(tile_grads, row, load(tile_grads, row) - first)
-        store(tile_grads, row + LANES, load(tile_grads, row + LANES) - second)
-        store(tile_grads, row + TILE_PIXELS, first)
-        store(tile_grads, row + TILE_PIXELS + LANES, second)
-
-
-@inline_kernel_no_refcount
-def _load_partial_tile_gradients(sums, grad_sums, left, top, tile_grads):
-    height, width = grad_sums.shape[1], grad_sums.shape[2]
+    height, width, num_rows = grad_sums.shape[1], grad_sums.shape[2], VALUE_LANES + 1
     for pixel in range(TILE_PIXELS):
         x, y = image_position(pixel, left, top)
-        total = np.float32(0)
-        for channel in range(VALUE_LANES + 1):
-            gradient = np.float32(0)
-            if x < width and y < height:
-                gradient = grad_sums[channel, y, x]
-                total += gradient * sums[channel, y, x]
-            tile_grads[channel * TILE_PIXELS + pixel] = gradient
-        tile_grads[VALUE_LANES * TILE_PIXELS + pixel] -= total
-        tile_grads[(VALUE_LANES + 1) * TILE_PIXELS + pixel] = total
+        is_inside = x < width and y < height
+        for row in range(num_rows):
+            tile_grads[row * TILE_PIXELS + pixel] = grad_sums[row, y, x] if is_inside else np.float32(0)
+            values[row * TILE_PIXELS + pixel] = sums[row, y, x] if is_inside else np.float32(0)
+    for pixel in range(0, TILE_PIXELS, LANES):
+        total = broadcast(np.float32(0))
+        for row in range(pixel, num_rows * TILE_PIXELS, TILE_PIXELS):
+            total = multiply_add(load(tile_grads, row), load(values, row), total)
+        last = VALUE_LANES * TILE_PIXELS + pixel
+        store(tile_grads, last, load(tile_grads, last) - total)
+        store(tile_grads, last + TILE_PIXELS, total)
 
 
 @inline_kernel_no_refcount
@@ -248,7 +224,7 @@ def _compute_block_weights(block, count, log2_alphas, indices, begin, transmitta
     """Compute alphas and weights of the Gaussians that a pixel of the block sees; return their number.
 
     Args:
-        log2_alphas, indices: of `count` Gaussians, from `begin` on.
+        log2_alphas, indices: numbers of `count` Gaussians, from `begin` on.
         alphas, weights, visible: written from `output` on; `visible` holds indices within the chunk.
     """
     transmitted, end = load(transmittance, block * LANES), output

@@ -52,7 +52,7 @@ BOX_BITS = 8
 inclusive. It may be larger than the footprint: the alpha cut removes the other pixels. A box that wraps around the
 panorama and reaches both ends of one tile has the tile's full width."""
 
-EQUIRECT_RAYS = 0  # columns: sine and cosine of the longitude; rows: of the latitude
+EQUIRECT_RAYS = 0  # columns: sine and cosine of the longitude; rows: sine and cosine of the latitude
 PINHOLE_RAYS = 1  # columns: x of the ray (x, y, 1); rows: y
 COLUMN_RAYS = 2  # a panorama of which each column is a column of blocks: see `tabulate_columns`
 BLOCK_WIDTH = 4  # pixels of a raster block

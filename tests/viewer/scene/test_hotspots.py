@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pansplat.inputs.pairs import Link
+from pansplat.inputs.panorama_sets import Link
 from pansplat.tours.outlook import BINS
 from pansplat_viewer.scene.camera import Camera
 from pansplat_viewer.scene.hotspots import find_clicked, find_hotspots

@@ -14,11 +14,12 @@ from refusals import expect_error
 
 from pansplat.errors import InputWarning
 from pansplat.gaussians.ply import save_ply
+from pansplat.gaussians.scene import SceneTour
 from pansplat.geometry.world import WorldFrame
 from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
-from pansplat.tours.graph import select_views
+from pansplat.tours.merge import select_views
 from pansplat_viewer.scene.loader import LoadedScene, SceneEntry, SceneLoader, find_entries, list_panoramas, load_entry
 from pansplat_viewer.scene.settings import DrawSettings
 from pansplat_viewer.scene.state import fit_settings
@@ -86,11 +87,11 @@ def test_photographs_are_placed_by_camera_heights_in_the_unit_of_their_files(hou
 
 
 def test_warnings_about_the_input_are_notes_of_its_entries(monkeypatch, house):
-    def load_pairs(path, **options):
+    def load_sets(path, **options):
         warnings.warn("b.jpg: no pose was found", InputWarning, stacklevel=2)
-        return [house.make_pair((0, 1))]
+        return [house.make_set((0, 1))]
 
-    monkeypatch.setattr("pansplat.pipeline.load_pairs", load_pairs)
+    monkeypatch.setattr("pansplat.pipeline.load_sets", load_sets)
     with pytest.warns(InputWarning, match="no pose was found"):
         (entry,) = find_entries(house.folder, ReadOptions(), PredictOptions())
     assert entry.notes == ("b.jpg: no pose was found",)
@@ -141,8 +142,8 @@ def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
     for (name, network), least in zip(networks.items(), (2, 1), strict=True):
         network.name, network.min_views = name, least
         monkeypatch.setitem(models._MODELS, name, lambda network=network: network)
-    monkeypatch.setattr("pansplat.pipeline.load_pairs", lambda path, **options: pairs)
-    pairs = [parted_house.make_pair(views) for views in ((0, 1), (1, 2), (3,))]
+    monkeypatch.setattr("pansplat.pipeline.load_sets", lambda path, **options: pairs)
+    pairs = [parted_house.make_set(views) for views in ((0, 1), (1, 2), (3,))]
     pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
     with pytest.warns(InputWarning, match="1 single view is predicted by default"):
         entries = find_entries(parted_house.folder, ReadOptions(), PredictOptions("pairs"))
@@ -228,7 +229,7 @@ def test_a_fused_tour_is_one_scene_that_is_drawn_jointly(tmp_path, small_scene):
     count = len(small_scene.cam2world)
     edges = tuple((view, view + 1, 0.5) for view in range(count - 1))
     for joint in (False, True):
-        save_ply(replace(small_scene, overlaps=edges, joint=joint), tmp_path / "tour.ply")
+        save_ply(replace(small_scene, tour=SceneTour(edges), joint=joint), tmp_path / "tour.ply")
         (entry,) = find_entries(tmp_path / "tour.ply", ReadOptions(), PredictOptions())
         loaded = load_entry(entry, PredictOptions())
         assert (loaded.entry.tour is None) == joint

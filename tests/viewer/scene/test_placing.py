@@ -16,7 +16,7 @@ import pansplat
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.geometry.path import wrap_angle
-from pansplat.inputs.pairs import Panorama
+from pansplat.inputs.panorama_sets import Panorama
 from pansplat.inputs.placements import Placement
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
@@ -74,7 +74,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def _list(folder: Path) -> list[SceneEntry]:
-    return [SceneEntry(pair.name, pair=pair) for pair in pansplat.load_pairs(folder)]
+    return [SceneEntry(pair.name, pair=pair) for pair in pansplat.load_sets(folder)]
 
 
 def _load(folder: Path) -> list[Panorama]:
@@ -185,7 +185,7 @@ def test_a_panorama_placed_at_its_true_pose_is_in_the_tour_after_saving_and_undo
     assert started.save() and started.node is None and started.error is None
     content = json.loads((folder / "poses.json").read_text())
     assert content["poses"].pop("c.png")["placed"] == "by hand" and content == json.loads(before)
-    (tour,) = find_tours(pansplat.load_pairs(folder))
+    (tour,) = find_tours(pansplat.load_sets(folder))
     views = {view.name: view for view in tour.originals}
     assert views["c"].placement.state == "by hand" and views["c"].world == views["a"].world
     assert np.allclose(views["c"].cam2world.numpy(), _pose("c"), atol=1e-6)

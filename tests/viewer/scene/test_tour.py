@@ -15,6 +15,7 @@ from PIL import Image
 from pansplat.export.film import Film, Shot
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.route import FADE_SECONDS, REST_SECONDS, plan_route
+from pansplat.tours.walks import plan_walk
 from pansplat_viewer import run
 from pansplat_viewer.capture import open_film, write_flight
 from pansplat_viewer.draw.cpu_renderer import CpuRenderer
@@ -65,7 +66,7 @@ def test_missing_scenes_are_requested_first_then_refinements(house, load_house, 
 
 def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, load_house):
     entry = SceneEntry(house.name, tour=house, max_views=64)
-    first = load_house(replace(entry, pair=house.make_pair((0, 1)), views=(0, 1), start=1))
+    first = load_house(replace(entry, pair=house.make_set((0, 1)), views=(0, 1), start=1))
     scenes = TourScenes.start(first)
     assert scenes.views == (0, 1) and scenes.loaded == [(0, 1)] and scenes.get((0, 1)) is first
     (part,) = scenes.list_next(None, 0.0)
@@ -89,7 +90,7 @@ def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, l
 
 
 def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
-    first = SceneEntry(house.name, tour=house, pair=house.make_pair((0, 1)), views=(0, 1), start=1, max_views=64)
+    first = SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
     scenes = TourScenes.start(load_house(first))
     camera = scenes.tour.cam2world[0].numpy()
     assert scenes.plan_way(camera, 1).steps[0].kind == "flight" and "fades" not in describe_panoramas(scenes.tour)
@@ -122,7 +123,7 @@ def test_a_zoom_shows_both_photographs_and_ends_in_that_of_its_goal(parted_house
 
 def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
     first = load_house(
-        SceneEntry(house.name, tour=house, pair=house.make_pair((0, 1)), views=(0, 1), start=1, max_views=64)
+        SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
     )
     scenes = TourScenes.start(first)
     (part,) = scenes.list_next(None, 0.0)
@@ -139,7 +140,7 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
 
 
 def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
-    monkeypatch.setattr("pansplat.tours.graph._MAX_PREDICTED", 2)
+    monkeypatch.setattr("pansplat.tours.scene_views._MAX_PREDICTED", 2)
     scenes = TourScenes(house, max_views=64)
     predictions = scenes.list_next(None, 0.0)
     assert set(predictions) == {(0, 1), (1, 2, 3)}, "with the best neighbour of panorama 2"
@@ -278,7 +279,7 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         loaded.append(entry.views)
         return load_house(entry)
 
-    route = plan_route(house, house.plan_walk(0), rest=REST_SECONDS)
+    route = plan_route(house, plan_walk(house, 0), rest=REST_SECONDS)
     written, complete = [], []
 
     def show_file(file):

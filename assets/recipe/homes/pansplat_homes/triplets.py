@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from pansplat.images.image_files import srgb_from_linear, write_depth, write_image
-from pansplat.inputs.pairs import FAR, NEAR
+from pansplat.inputs.panorama_sets import FAR, NEAR
 from pansplat.inputs.views import Sample, Views
 from pansplat.system.atomic import replacing
 from pansplat_homes.homes import Home, build_home

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat_homes.__main__ import run
 
 COMMANDS = ("homes", "photographs", "flights", "triplets", "maps", "train-depth", "train-sharpening", "convert-matcher")
@@ -59,7 +59,7 @@ def test_commands_write_folders_and_say_what(tmp_path: Path, capsys: pytest.Capt
     assert f"{photographs} photographs of 1 homes" in capsys.readouterr().out
     assert run(["flights", "-o", str(tmp_path / "f"), "--count", "1", "--height", "64"]) == 0
     assert "1 flights of " in capsys.readouterr().out
-    assert len(load_pairs(tmp_path / "f" / "flight_00")) == 1
+    assert len(load_sets(tmp_path / "f" / "flight_00")) == 1
     assert run(["homes", "-o", str(tmp_path / "h"), "--count", "1", "--height", "32", "--cameras", "2"]) == 0
     assert "1 new shards" in capsys.readouterr().out
     assert zipfile.is_zipfile(tmp_path / "h" / "shard_00000.npz")

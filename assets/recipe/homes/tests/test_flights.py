@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pansplat.inputs.folders import load_pairs
+from pansplat.inputs.folders import load_sets
 from pansplat_homes.flights import NAMES, write_flight
 
 HEIGHT = 32
@@ -21,7 +21,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 @pytest.mark.slow
 def test_a_flight_is_a_pair_with_targets_at_equal_distances(flight: tuple[Path, float]) -> None:
     folder, length = flight
-    (pair,) = load_pairs(folder)
+    (pair,) = load_sets(folder)
     context, targets = pair.load_context(HEIGHT), pair.load_targets(HEIGHT)
     start, end = context.cam2world[:, :3, 3]
     shares = (targets.cam2world[:, :3, 3] - start) @ (end - start) / length**2
@@ -33,7 +33,7 @@ def test_a_flight_is_a_pair_with_targets_at_equal_distances(flight: tuple[Path, 
 @pytest.mark.slow
 def test_targets_have_depth_and_the_way_is_free(flight: tuple[Path, float]) -> None:
     folder, _ = flight
-    (pair,) = load_pairs(folder)
+    (pair,) = load_sets(folder)
     depths = pair.load_targets(HEIGHT).depths
     assert depths is not None and depths.shape == (3, HEIGHT, 2 * HEIGHT)
     assert depths.min() > 0.2 and 0.5 < depths.median() < 10

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -62,9 +63,9 @@ class Note:
     """Information at a direction in a panorama, as a tour states it.
 
     Attributes:
-        yaw, pitch: as of a link, radians.
+        yaw, pitch: its direction, as that of a link, radians.
         text: plain text of one or more lines.
-        addresses: of web pages, http or https.
+        addresses: web pages, http or https.
     """
 
     yaw: float
@@ -136,7 +137,7 @@ class Panorama:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class PanoramaSet:
     """Context and target panoramas of one scene; a scene of a single view has one context panorama.
 
     Image files are read by `load_context` and `load_targets`.
@@ -163,7 +164,7 @@ class Pair:
         if self.targets:
             parts.append(f"target{'s' if len(self.targets) > 1 else ''} {list_first([p.name for p in self.targets])}")
         parts.append(f"near and far {describe_range(self.near, self.far, 'm')}")
-        return f"<Pair {self.name}: {', '.join(parts)}, in {self.folder}>"
+        return f"<PanoramaSet {self.name}: {', '.join(parts)}, in {self.folder}>"
 
     @property
     def image_height(self) -> int:
@@ -234,7 +235,7 @@ class Collection:
 
     Attributes:
         source: file or folder that error messages name.
-        folder: of the files.
+        folder: the folder of the files.
         panoramas: in file order; none if no poses are known.
         groups: given context and target views; None to pair neighbours.
         ordered: whether the panoramas are in order along a path, so that consecutive ones are neighbours.
@@ -267,7 +268,7 @@ class Collection:
         """Whether there are panoramas for an estimate of poses, and no poses."""
         return not self.panoramas and len(self.unposed) > 1
 
-    def pairs(self, near: float | None = None, far: float | None = None) -> list[Pair]:
+    def sets(self, near: float | None = None, far: float | None = None) -> list[PanoramaSet]:
         """One pair per group, those with targets first, then one of a single view for each other panorama.
 
         Warns about posed panoramas that are in no group.
@@ -290,7 +291,9 @@ class Collection:
         for indices in groups:
             context, targets = (tuple(self.panoramas[i] for i in part) for part in indices)
             name = self.name or "-".join(view.name for view in context)
-            pairs.append(Pair(name, folder, context, targets, *self._range(context[0].world, near, far), siblings))
+            pairs.append(
+                PanoramaSet(name, folder, context, targets, *self._range(context[0].world, near, far), siblings)
+            )
         used = {i for group in groups for part in group for i in part}
         alone = [panorama for i, panorama in enumerate(self.panoramas) if i not in used]
         if alone:
@@ -300,10 +303,12 @@ class Collection:
                 category=InputWarning,
                 stacklevel=4,
             )
-        pairs += [Pair(view.name, folder, (view,), (), *self._range(view.world, near, far), siblings) for view in alone]
+        pairs += [
+            PanoramaSet(view.name, folder, (view,), (), *self._range(view.world, near, far), siblings) for view in alone
+        ]
         first_world = 1 + max((panorama.world for panorama in self.panoramas), default=-1)
         every = tuple(heapq.merge(self.panoramas, self.unposed, key=lambda panorama: panorama.name))
-        single = single_view_pairs(self.unposed, folder, near, far, siblings=every, first_world=first_world)
+        single = single_view_sets(self.unposed, folder, near, far, siblings=every, first_world=first_world)
         return [replace(pair, name=self.name or pair.name) for pair in single] if not pairs else pairs + single
 
     def _range(self, world: int, near: float | None, far: float | None) -> tuple[float, float]:
@@ -344,22 +349,14 @@ class Collection:
         if self.ordered or count == 2:
             return list(itertools.pairwise(members))
         centres = torch.stack([self.panoramas[number].cam2world[:3, 3] for number in members])
-        distance = (centres - centres[0]).norm(dim=-1).round(decimals=6)  # Prim's algorithm; in a grid many are equal
-        parent = torch.zeros(count, dtype=torch.long)
-        outside = torch.ones(count, dtype=torch.bool)
-        outside[0] = False
-        edges = []
-        while outside.any():
-            new = int(torch.where(outside, distance, torch.inf).argmin())
-            edges.append(tuple(sorted((members[int(parent[new])], members[new]))))
-            outside[new] = False
-            distance_to_new = (centres - centres[new]).norm(dim=-1).round(decimals=6)
-            parent[distance_to_new < distance] = new
-            distance = torch.minimum(distance, distance_to_new)
-        return sorted(edges)
+        distances = (centres[:, None] - centres).norm(dim=-1).round(decimals=6)
+        # Of equal distances, as in a grid, the first ones are taken on every processor. A weight of 0 is no edge.
+        weights = distances.unique(return_inverse=True)[1] * count**2 + torch.arange(1, count**2 + 1).view(count, count)
+        tree = scipy.sparse.csgraph.minimum_spanning_tree(weights.triu(1).double().numpy())
+        return sorted(tuple(sorted((members[a], members[b]))) for a, b in zip(*tree.nonzero(), strict=True))
 
 
-def localize_pairs(pairs: Sequence[Pair], camera_height: float = CAMERA_HEIGHT) -> list[Pair]:
+def localize_sets(pairs: Sequence[PanoramaSet], camera_height: float = CAMERA_HEIGHT) -> list[PanoramaSet]:
     """The pairs of one camera height in working worlds (`WorldFrame`), one for all panoramas of a world of a folder."""
     worlds: dict[tuple[Path, int], list[tuple[Tensor, float]]] = {}
     for pair in pairs:
@@ -380,7 +377,7 @@ def localize_pairs(pairs: Sequence[Pair], camera_height: float = CAMERA_HEIGHT) 
     return localized
 
 
-def single_view_pairs(
+def single_view_sets(
     panoramas: Sequence[Panorama],
     folder: Path,
     near: float | None,
@@ -388,20 +385,20 @@ def single_view_pairs(
     *,
     siblings: Sequence[Panorama] | None = None,
     first_world: int = 0,
-) -> list[Pair]:
+) -> list[PanoramaSet]:
     """A pair of one view for each panorama.
 
     Args:
-        folder: of the tour; predictions are cached there.
+        folder: the tour's; predictions are cached there.
         near, far: metres; None for the range of rooms.
         siblings: panoramas of the same camera, by default the same ones.
-        first_world: of the first panorama; each has a world of its own.
+        first_world: the world of the first panorama; each has a world of its own.
     """
     near, far = NEAR if near is None else near, FAR if far is None else far
     require_depth_range(near, far, folder, 'set "near" and "far" on the command line')
     images = tuple(panorama.image for panorama in (panoramas if siblings is None else siblings))
     return [
-        Pair(view.name, folder, (replace(view, world=world),), (), near, far, images)
+        PanoramaSet(view.name, folder, (replace(view, world=world),), (), near, far, images)
         for world, view in enumerate(panoramas, start=first_world)
     ]
 
