@@ -235,7 +235,7 @@ def _place_group(
     """The group that relations connect: placed by a tree of the strongest ones, then adjusted together."""
     poses = {min(relations)[0]: np.eye(4)}
     while leaving := [pair for pair in relations if (pair[0] in poses) != (pair[1] in poses)]:
-        i, j = max(leaving, key=lambda pair: relations[pair].score)
+        i, j = max(leaving, key=lambda pair: (relations[pair].log_odds, relations[pair].score))
         if i in poses:
             poses[j] = poses[i] @ np.linalg.inv(relations[i, j].motion)
         else:
