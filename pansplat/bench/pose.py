@@ -18,22 +18,19 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from pansplat.bench.harness import Header, Suite, announce, make_axes
+from pansplat.bench.harness import Suite, announce
 from pansplat.errors import InputError
 from pansplat.evaluation.results import Column, Row
 from pansplat.inputs.folders import load_sets
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.estimate import PoseEstimate, estimate_poses
 from pansplat.poses.solvers import angle_between, rotation_angle
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _WRONG_ROTATION, _WRONG_DIRECTION = 3.0, 10.0  # degrees; a pair with larger errors is wrong
 _WRONG_TURN, _WRONG_PLACE = 5.0, 30.0  # degrees and centimetres; a tour's camera with larger errors is wrong
@@ -135,22 +132,6 @@ def summarise(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def plot_poses(rows: Sequence[Row], header: Header) -> Figure:
-    """Plot the errors of rotation and direction over the baseline, and the cumulative distributions."""
-    figure, axes = make_axes(2, (12, 4))
-    for outcome, marker in (("solved", "o"), ("wrong", "x")):
-        chosen = [row for row in rows if row.get("outcome") == outcome and row.get("count") == 2]
-        for name in ("rotation", "direction") if chosen else ():
-            values = [row.get(f"{name}_degrees") for row in chosen]
-            axes[0].semilogy([row.get("baseline_m") for row in chosen], values, marker, label=f"{name}, {outcome}")
-            axes[1].plot(np.sort(values), np.linspace(0, 1, len(values)), ".-", label=f"{name}, {outcome}")
-            axes[0].legend(fontsize=8)
-    axes[0].set(xlabel="distance of the cameras, m", ylabel="error, degrees")
-    axes[1].set(xlabel="error, degrees", ylabel="fraction of the pairs", xlim=(0, 2))
-    figure.suptitle(header["machine"]["cpu"], x=0.01, ha="left", fontsize=9)
-    return figure
-
-
 POSE = Suite(
     "pose",
     (
@@ -167,6 +148,6 @@ POSE = Suite(
         Column("s", "seconds", ".1f"),
     ),
     lambda row: row.get("suite"),
-    plot_poses,
+    lambda rows, header: None,
     summarise,
 )

@@ -63,12 +63,12 @@ def _print_estimate(estimate: PoseEstimate, *, figures: bool) -> None:
     table = Table()
     for column in ("pair", "score", "places", "odds", "parallax", "rotation +-", "direction +-", "check"):
         table.add_column(column, justify="left" if column in ("pair", "check") else "right")
-    for (i, j), relation in estimate.relations.items():
+    for pair, relation in estimate.relations.items():
         if relation.is_reliable or len(estimate.relations) <= 3:
             problem = relation.problem or ("certain" if relation.is_certain else "probable")
             degrees = [math.degrees(angle) for angle in (relation.parallax, *relation.uncertainty)]
             table.add_row(
-                " - ".join(estimate.name_of(estimate.images[n]) for n in (i, j)),
+                " - ".join(map(estimate.name_of, pair)),
                 *(f"{value:.0f}" for value in (relation.score, relation.places)),
                 "matches suffice" if math.isinf(relation.log_odds) else f"{math.exp(relation.log_odds):.1f}",
                 f"{degrees[0]:.1f}",

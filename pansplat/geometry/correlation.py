@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -21,8 +21,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.geometry.warp import Sampling, warp_panorama, warp_positions
-
-Backend = Literal["auto", "torch", "kernel"]
 
 _CHUNK = 1 << 22
 """Largest number of elements of the warped features, or of the positions, in memory at a time."""
@@ -209,7 +207,6 @@ def correlate(
     inverse_depth: Float[Tensor, "pair candidate height width"],
     pose: Float[Tensor, "pair 4 4"],
     sampling: Sampling = "sphere",
-    backend: Backend = "auto",
 ) -> Float[Tensor, "pair candidate height width"]:
     """Dot products of each pixel's features with the other panorama's at each depth candidate, over sqrt(channel).
 
@@ -222,41 +219,41 @@ def correlate(
         inverse_depth: candidates of each pixel, 1 / metres.
         pose: from the reference camera's axes to the other's.
         sampling: see `pansplat.geometry.warp`.
-        backend: "kernel" runs on the CPU only, "torch" on any device; "auto" selects the faster one.
     """
-    if backend == "auto":
-        backend = "kernel" if reference.device.type == "cpu" else "torch"
     dtype = torch.promote_types(reference.dtype, torch.float32)
     # Scaled before the product, so that no partial sum overflows.
     scaled = reference.to(dtype) / math.sqrt(reference.shape[1])
     candidates = inverse_depth.detach().to(dtype)
-    return _Correlation.apply(scaled, other.to(dtype), candidates, pose.detach(), sampling, backend)
+    return _Correlation.apply(scaled, other.to(dtype), candidates, pose.detach(), sampling)
+
+
+def _uses_kernels(features: Tensor) -> bool:
+    return features.device.type == "cpu"
 
 
 class _Correlation(torch.autograd.Function):
     """Correlates a chunk of candidates at a time; the backward pass computes their samples again."""
 
     @staticmethod
-    def forward(ctx, reference, other, inverse_depth, pose, sampling, backend):
+    def forward(ctx, reference, other, inverse_depth, pose, sampling):
         ctx.save_for_backward(reference, other, inverse_depth, pose)
-        ctx.options = sampling, backend
-        correlate_chunk = _correlate_by_kernel if backend == "kernel" else _correlate_by_warp
-        chunks = _chunks(inverse_depth, reference, backend)
+        ctx.sampling = sampling
+        correlate_chunk = _correlate_by_kernel if _uses_kernels(reference) else _correlate_by_warp
+        chunks = _chunks(inverse_depth, reference)
         return torch.cat([correlate_chunk(reference, other, chunk, pose, sampling) for chunk in chunks], dim=1)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):  # pyright: ignore[reportIncompatibleMethodOverride]
         reference, other, inverse_depth, pose = ctx.saved_tensors
-        sampling, backend = ctx.options
-        backward_chunk = _backward_by_kernel if backend == "kernel" else _backward_by_warp
+        backward_chunk = _backward_by_kernel if _uses_kernels(reference) else _backward_by_warp
         grad_reference, grad_other = torch.zeros_like(reference), torch.zeros_like(other)
-        chunks = _chunks(inverse_depth, reference, backend)
+        chunks = _chunks(inverse_depth, reference)
         for chunk, part in zip(chunks, gradient.split([c.shape[1] for c in chunks], dim=1), strict=True):
-            parts = backward_chunk(part, reference, other, chunk, pose, sampling)
+            parts = backward_chunk(part, reference, other, chunk, pose, ctx.sampling)
             grad_reference += parts[0]
             grad_other += parts[1]
-        return grad_reference, grad_other, None, None, None, None
+        return grad_reference, grad_other, None, None, None
 
 
 def _correlate_by_warp(reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling) -> Tensor:
@@ -285,7 +282,7 @@ def _backward_by_kernel(
     return correlate_positions_backward(part, reference, other, *positions, wraps=sampling == "sphere")
 
 
-def _chunks(inverse_depth: Tensor, reference: Tensor, backend: Backend) -> tuple[Tensor, ...]:
+def _chunks(inverse_depth: Tensor, reference: Tensor) -> tuple[Tensor, ...]:
     """The candidates in chunks of at most `_CHUNK` elements: warped features, or positions for the kernels."""
-    elements = inverse_depth[:, :1].numel() if backend == "kernel" else reference.numel()
+    elements = inverse_depth[:, :1].numel() if _uses_kernels(reference) else reference.numel()
     return inverse_depth.split(max(1, _CHUNK // max(1, elements)), dim=1)

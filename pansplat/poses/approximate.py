@@ -15,8 +15,8 @@ import numpy as np
 
 from pansplat.poses.placing import Guess, Piece, PlanPose, list_through_door
 
-_LEAST_PROBABILITY = 0.5
-_SAME, _TURN = 1.0, 0.3  # distance of places that support each other, camera heights, and turn, radians
+_LEAST_PROBABILITY = 0.5  # a place that is less probable is not stated
+_SAME, _TURN = 1.0, 0.3  # places that support each other are nearer: camera heights, and turn, radians
 
 
 class LinkedPlace(NamedTuple):
@@ -24,7 +24,7 @@ class LinkedPlace(NamedTuple):
 
     Attributes:
         beside: a panorama with a pose, or with links only.
-        place: relative to it, camera heights.
+        place: its place relative to that panorama, camera heights.
         by: the panoramas whose links state the place.
     """
 
@@ -49,8 +49,8 @@ def place_linked(
     Of panoramas that none joins with a world, the others are beside the one with most links.
 
     Args:
-        pieces: of all panoramas.
-        links: of each panorama, the yaw of its links to others, radians to the right of the centre.
+        pieces: what each panorama shows.
+        links: the yaw of the links of each panorama to others, radians to the right of the centre.
         worlds: known places of panoramas on the plan of each world, camera heights.
     """
     known = {image: _Known(next(iter(world)), place) for world in worlds for image, place in world.items()}
@@ -81,7 +81,7 @@ def _vote(guesses: Mapping[Path, Sequence[Guess]], known: Mapping[Path, _Known])
     """The most probable place of a panorama, and the panoramas beside it that support it.
 
     Args:
-        guesses: of its place relative to others.
+        guesses: its places relative to others.
         known: panoramas with a place.
     """
     best, by = _Known(Path(), PlanPose(0.0, 0.0, 0.0), 0.0), ()

@@ -21,19 +21,19 @@ from numpy import ndarray as Array
 from pansplat.poses.features import FACE_ROTATIONS, render_face
 from pansplat.poses.solvers import rotation_angle, rotation_exp, skew
 
-_MIN_LENGTH = math.radians(2.5)  # of a segment
+_MIN_LENGTH = math.radians(2.5)  # shorter segments are not used
 _NORMAL_NOISE = 4e-3  # standard deviation of a normal, radians
-_ROUNDS = 25  # of the fit; its tolerance shrinks
+_ROUNDS = 25  # steps of the fit, in which its tolerance shrinks
 _FIRST_TOLERANCE = math.radians(3)
 _SEARCH_TOLERANCE = math.radians(1.5)
-_LARGEST_TILT = math.radians(20)  # of the camera
-_MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments of an axis, also relative to the number by chance
-_LONG = math.radians(10)  # segments whose scatter measures the noise of the axes: pixels hardly matter
-_LEAST_NOISE, _LARGEST_NOISE = math.radians(0.03), math.radians(0.26)  # of the normals of long segments
-_TILT_NOISE, _YAW_NOISE = 0.8, 1.35  # of the relative rotation about horizontal axes and gravity, in this noise
-_LARGEST_RESIDUAL = 7.0  # of a rotation that the axes are taken to determine, in the noise's unit
-_LARGEST_DIFFERENCE = math.radians(1.8)  # of axes that count as parallel
-_AGREEMENT = 0.9, 0.06  # prior probability of axes of one building, and of upright cameras in different ones
+_LARGEST_TILT = math.radians(20)  # a camera is less tilted
+_MIN_SUPPORT, _MIN_CONTRAST = 12, 2.5  # segments that an axis needs; also their ratio to the number by chance
+_LONG = math.radians(10)  # longer segments measure the noise of the axes, because pixels hardly matter
+_LEAST_NOISE, _LARGEST_NOISE = math.radians(0.03), math.radians(0.26)  # limits of the noise of long normals
+_TILT_NOISE, _YAW_NOISE = 0.8, 1.35  # noise of a relative rotation, about horizontal axes and gravity, over theirs
+_LARGEST_RESIDUAL = 7.0  # a rotation that differs more from the axes does not follow them; in the noise's unit
+_LARGEST_DIFFERENCE = math.radians(1.8)  # walls that differ by less are parallel
+_AGREEMENT = 0.9, 0.06  # prior probability that axes are of one building, or only upright in different ones
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,12 +18,12 @@ from numpy import ndarray as Array
 from pansplat.poses.solvers import rotation_exp, skew
 
 _STEPS = 30
-_DISTANCE_NOISE = 0.015  # of a known distance, relative
-_DOWN_NOISE = 0.01  # of the cameras' down directions, radians
+_DISTANCE_NOISE = 0.015  # relative standard deviation of a known distance
+_DOWN_NOISE = 0.01  # standard deviation of the cameras' down directions, radians
 _CAUCHY = 2.0  # residual at which the loss has half of its weight, in the noise's unit
 _BEHIND = 1e6  # squared residual of a point behind its camera
 _LARGEST_DAMPING = 1e8
-_CONVERGED = 1e-6  # relative decrease of the cost
+_CONVERGED = 1e-6  # the adjustment ends when the cost falls by a smaller share
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +31,12 @@ class Bundle:
     """Cameras, points and observations.
 
     Attributes:
-        rotations, centres: of the cameras, camera to world.
+        rotations, centres: poses of the cameras, camera to world.
         points: homogeneous unit vectors in the world.
         camera, point: indices for each observation.
         bearings: observed unit directions in the camera's frame.
         downs: for each camera the down direction in its frame; NaN where it is unknown.
-        down: in the world.
+        down: the down direction of the world.
         pairs, distances: cameras whose distance is known independently of the points.
     """
 

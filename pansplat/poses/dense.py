@@ -24,16 +24,16 @@ from pansplat.poses.solvers import compiled
 from pansplat.system.kernels import fast_atan2
 
 _HEIGHT = 96  # rows of the maps that are compared
-_COARSE, _FINE = 4, 2  # of many poses, every fourth or second row and column are compared
+_COARSE, _FINE = 4, 2  # step of the rows and columns in which many poses, or fewer, are compared
 _BLUR, _REGION = 0.5, 6.0  # standard deviations of the compared detail and of its surroundings, pixels
-_LEAST_CONTRAST, _LOG_OFFSET = 0.03, 0.02  # grey values of 1
+_LEAST_CONTRAST, _LOG_OFFSET = 0.03, 0.02  # added to deviations and to grey values, which are 0 to 1
 _LEAST_HUE = 0.06  # deviation of the logarithm of a ratio of colours that noise hides
-_TOLERANCE = 0.12  # of log-depth, beside the deviations of both estimates
+_TOLERANCE = 0.12  # surfaces are the same within this log-depth and the deviations of both estimates
 _CONFLICT = 0.25  # least log-depth that a surface in front of another one has against it
 _CERTAIN = 0.3  # largest sum of the deviations at a conflict
-_NEAREST = 0.25  # camera heights
-_LEAST_COMMON = 0.002  # of the sphere
-_FULL_OVERLAP = 0.1  # of the sphere, above which likeness and shade have their full weight
+_NEAREST = 0.25  # nearer surfaces are not compared, camera heights
+_LEAST_COMMON = 0.002  # what is common to less of the sphere states no likeness
+_FULL_OVERLAP = 0.1  # share of the sphere above which likeness and shade have their full weight
 _LEAST_FACING = 0.3  # cosine of the angle between both estimated normals of one surface
 
 
@@ -67,7 +67,7 @@ class Surroundings:
 
     Attributes:
         image: RGB in [0, 1], as the camera took it.
-        depth: of the same panorama.
+        depth: estimated depth of the panorama.
     """
 
     image: Float[Array, "h 2*h 3"]
@@ -127,7 +127,7 @@ def compare_many(
 
 
 def _compare_all(first: Surroundings, second: Surroundings, rotations: Array, translations: Array, step: int) -> Array:
-    a, b = first.depth.rotation, second.depth.rotation  # of the upright cameras
+    a, b = first.depth.rotation, second.depth.rotation  # axes of the upright cameras
     there = b.T @ rotations @ a, translations @ b
     back = there[0].transpose(0, 2, 1), -np.einsum("nji,nj->ni", there[0], there[1])
     values = np.zeros((len(rotations), 5))
@@ -160,7 +160,7 @@ def _compare_one_way(points, source, target, rotations, translations, step):
     for n in range(count):
         r, t = rotations[n], translations[n]
         total = common = conflict = 0.0
-        sums = np.zeros((4, 5))  # of a, b, a a, b b, a b: for detail, grey, and both of hue
+        sums = np.zeros((4, 5))  # a, b, a a, b b, a b: for detail, grey, and both of hue
         for i in range(step // 2, height, step):
             weight = math.cos(((i + 0.5) / height - 0.5) * math.pi)
             for j in range(step // 2, width, step):
@@ -196,7 +196,7 @@ def _compare_one_way(points, source, target, rotations, translations, step):
                     conflict += weight
         result[n, 0], result[n, 1] = common / total, conflict / total
         if common > _LEAST_COMMON * total:
-            hue = np.zeros(3)  # of a a, b b, a b
+            hue = np.zeros(3)  # sums of a a, b b, a b
             for k in range(4):
                 a, b = sums[k, 0] / common, sums[k, 1] / common
                 squares = sums[k, 2] / common - a * a, sums[k, 3] / common - b * b, sums[k, 4] / common - a * b

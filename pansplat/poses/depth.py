@@ -16,16 +16,14 @@ from numpy import ndarray as Array
 
 from pansplat.sweep.surface import rotate_image, upright_rotation
 
-_LEAST_DEVIATION = 0.04  # of log-depth at a right match: heights of two cameras differ, too
-_SCALE_SHARE = 1.0  # of the network's own Laplace scale
+_LEAST_DEVIATION = 0.04  # deviation of log-depth at a right match: heights of two cameras differ, too
 _TAIL = 2.0  # degrees of freedom of a right match's deviation
-_CHANCE_SCALE = 1.0  # Laplace scale of a wrong match's deviation
 _EQUAL = 0.1  # deviation of both sides' difference at a wrong match on one floor or ceiling
-_WRONG_SHARE = 0.1  # of right matches whose depth is wrong: edges, windows and mirrors
-_STEP = 0.04  # of the search of the distance, logarithm
-_DISTANCES = math.log(0.05), math.log(30.0)  # of two cameras, camera heights
+_WRONG_SHARE = 0.1  # share of right matches whose depth is wrong: edges, windows and mirrors
+_STEP = 0.04  # step of the search of the distance, logarithm
+_DISTANCES = math.log(0.05), math.log(30.0)  # distances of two cameras that are searched, camera heights
 _SMOOTHING = np.exp(-0.5 * (np.arange(-4, 5) / 1.5) ** 2)
-_DENSITY = math.gamma((_TAIL + 1) / 2) / math.gamma(_TAIL / 2) / math.sqrt(_TAIL * math.pi)  # of Student's t at 0
+_DENSITY = math.gamma((_TAIL + 1) / 2) / math.gamma(_TAIL / 2) / math.sqrt(_TAIL * math.pi)  # Student's t at 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +31,7 @@ class DepthMap:
     """Estimated depth of a panorama.
 
     Attributes:
-        log_depth: in camera heights, of the upright panorama.
+        log_depth: logarithm of the depth of the upright panorama, camera heights.
         scale: Laplace scale of it, at any size.
         rotation: the upright camera's axes in the camera's frame, as columns.
     """
@@ -45,7 +43,7 @@ class DepthMap:
     def sample(self, bearings: Float[Array, "n 3"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """Log-depth and its standard deviation at bearings of the camera."""
         upright = bearings @ self.rotation
-        deviation = np.hypot(_LEAST_DEVIATION, _SCALE_SHARE * sample_nearest(self.scale, upright))
+        deviation = np.hypot(_LEAST_DEVIATION, sample_nearest(self.scale, upright))
         return sample_nearest(self.log_depth, upright), deviation
 
     def mirrored(self) -> DepthMap:
@@ -84,7 +82,7 @@ class MatchDepths:
     """Estimated depth at matches, in both panoramas.
 
     Attributes:
-        log_depth, deviation: of the first and of the second panorama.
+        log_depth, deviation: log-depth and its deviation in the first and in the second panorama.
     """
 
     log_depth: Float[Array, "match 2"]
@@ -99,7 +97,7 @@ class MatchDepths:
 
         Args:
             depths: triangulated, in units of the distance; positive where `weight` is.
-            weight: of each match.
+            weight: weight of each match.
         """
         used = weight > 1e-3
         if not used.any():
@@ -128,9 +126,9 @@ class MatchDepths:
 
         Args:
             depths: triangulated, in units of the distance.
-            distance: of the cameras, camera heights.
-            parallax: of each match, radians.
-            noise: of the triangulation's bearings, radians.
+            distance: distance of the cameras, camera heights.
+            parallax: parallax of each match, radians.
+            noise: standard deviation of the bearings, radians.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.log(depths * distance) - self.log_depth
@@ -138,7 +136,7 @@ class MatchDepths:
         shared = noise / np.maximum(parallax, 1e-6)  # relative error of the triangulation
         deviation = np.hypot(self.deviation, shared[:, None])
         right = np.prod(_DENSITY / deviation * (1 + (error / deviation) ** 2 / _TAIL) ** (-(_TAIL + 1) / 2), axis=1)
-        chance = 0.5 / _CHANCE_SCALE * np.exp(-np.abs(error) / _CHANCE_SCALE)
+        chance = 0.5 * np.exp(-np.abs(error))  # a wrong match's deviation has Laplace's scale 1
         equal = np.exp(-0.5 * ((error[:, 0] - error[:, 1]) / _EQUAL) ** 2) / (_EQUAL * math.sqrt(2 * math.pi))
         by_chance = 0.5 * chance.prod(axis=1) + 0.5 * chance[:, 0] * np.maximum(equal, 1e-6)
         known = shared < 0.5

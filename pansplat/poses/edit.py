@@ -33,10 +33,10 @@ from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.pose_file import (
     format_pose_file,
     make_pose_content,
-    make_pose_file,
     make_range,
     mark_worlds,
     matrix_of,
+    rename_panoramas,
     world_of,
 )
 from pansplat.system.atomic import replacing
@@ -61,13 +61,13 @@ class PoseEditor:
         """Nothing is written before the first change.
 
         Args:
-            folder: of the tour.
+            folder: the folder of the tour.
             panoramas: all of it, as they were loaded.
         """
         self.file = folder / POSES
         self._sources = {panorama.placement.source for panorama in panoramas} - {None}
         self._names = name_pictures(self.file, [panorama.image for panorama in panoramas])
-        self._by_name = {panorama.name: panorama.image for panorama in panoramas}
+        self._images = {panorama.name: panorama.image for panorama in panoramas}
         if not self._sources:
             raise InputError(f"{folder}: needed estimated poses or a {POSES} to change poses, got another format.")
         self._undo: list[tuple[bytes | None, bytes]] = []
@@ -97,7 +97,9 @@ class PoseEditor:
         if self.file.exists():
             return read_pose_content(self.file)
         (source,) = self._sources
-        return _convert(read_entry(source), self._names, self._by_name)
+        files = {name: image.name for name, image in self._images.items()}
+        names = {name: self._names[image] for name, image in self._images.items()}
+        return rename_panoramas(read_entry(source), names, files)
 
     def read_unit(self, world: int) -> float | None:
         """Metres that are one camera height of the estimated depths in a world, if the file states it."""
@@ -108,7 +110,7 @@ class PoseEditor:
 
         Args:
             poses: cam2world of each, metres.
-            world: of the file, whose other panoramas they are placed beside; None for one of their own.
+            world: number of the world whose panoramas they are placed beside; None for one of their own.
             unit: metres that are a camera height, of a new world.
         """
         content = self.read()
@@ -173,8 +175,8 @@ def merge_estimate(
 
     Args:
         file: the poses.json.
-        estimate: of panoramas.
-        names: of the files in it.
+        estimate: the new poses.
+        names: the name of each of its files in the poses.json.
         overwrite: whether all poses are replaced that the estimate has.
     """
     content = read_pose_content(file)
@@ -268,22 +270,6 @@ def name_pictures(path: Path, images: Sequence[Path]) -> dict[Path, str]:
             file = locate_inside(path.parent, os.path.abspath(image), path)
             names[image] = file.relative_to(path.parent).as_posix()
     return names
-
-
-def _convert(cached: Content, names: Mapping[Path, str], by_name: Mapping[str, Path]) -> Content:
-    """A cached estimate as the content of a poses.json."""
-
-    def rename(name: str) -> str:
-        return names[by_name[name]] if name in by_name else name
-
-    worlds = [
-        world | {"poses": {rename(name): pose for name, pose in world["poses"].items()}} for world in cached["worlds"]
-    ]
-    approximate = [
-        about | {key: [*map(rename, about[key])] for key in ("between", "by")} for about in cached["approximate"]
-    ]
-    unplaced = {by_name[name].name if name in by_name else name: reason for name, reason in cached["unplaced"].items()}
-    return make_pose_file(worlds, {"summary": cached["summary"], "unplaced": unplaced, "approximate": approximate})
 
 
 def _find_free_world(content: Content, former: Sequence[Any] = ()) -> int:

@@ -57,28 +57,28 @@ from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_file, hash_parts
 from pansplat.system.threads import one_thread, worker_threads
 
-_HEIGHT = 1024  # pixels; larger panoramas are reduced
-_MIN_HEIGHT = 256
-_QUICK_FEATURES = 2500  # per panorama, to choose the pairs that are compared thoroughly
+_HEIGHT, _MIN_HEIGHT = 1024, 256  # largest and smallest number of rows that are worked with
+# Which pairs are compared: chosen on tours of 10 to 30 generated panoramas.
+_QUICK_FEATURES = 2500  # strongest features of a panorama, by which pairs are chosen
 _THOROUGH = 6  # pairs of each panorama that are compared with all features, at most
-_ALL_PAIRS_UP_TO = 3  # panoramas, of which all pairs are compared with all features
-_NEEDED_PAIRS = 4  # certain pairs of a panorama; more are not looked for within a group
+_ALL_PAIRS_UP_TO = 3  # panoramas of which all pairs are compared with all features
+_NEEDED_PAIRS = 4  # certain pairs of a panorama, above which no more are sought within its group
 _LEAST_BATCH = 4  # pairs that are compared before others are chosen
-_MATCHER_SECONDS = 1.5  # of the learned matcher for a panorama on two cores, about
-_PAIR_TIME = 1.3  # of a comparison, over that of the features of a panorama
-_MASK_KEPT_SHARE = 0.6  # of the panoramas whose common mask is kept when others are added
+_MATCHER_SECONDS = 1.5  # about the seconds of the learned matcher for a panorama, on two cores
+_PAIR_TIME = 1.3  # time of a comparison over that of the features of a panorama, for the progress bar
+_MASK_KEPT_SHARE = 0.6  # the common mask stays when others are added to so large a share of the panoramas
+# What cannot be used; grey values are 0 to 255.
 _BLANK_BRIGHTNESS = 8.0  # mean grey value of an image that shows nothing
-_LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # grey values: across the edges; along the rows at the poles
-_SAME_IMAGE = 1.5  # mean grey difference of two copies of one image
-_ENOUGH_SIFT_MATCHES = 100.0  # expected number of right matches by SIFT, above which the learned matcher is not asked
-_COUNTED_PRIOR = 0.3  # probability of the matches that count for it
-_LEARNED_PRIOR, _LEARNED_NOISE = 0.7, 1.6e-3  # largest prior, as matches of one pair of faces depend; radians
-_LEARNED_SIZE = 7.0  # pixels
-_MIRROR_EVIDENCE = 60.0  # expected number of right matches with a mirror image
-_MIRROR_RATIO = 1.5  # of that number to the one with the picture itself; symmetric things match either way
+_LARGEST_SEAM, _POLE_DEVIATION = 12.0, 10.0  # largest difference across the edges, and deviation along a pole's row
+_SAME_IMAGE = 1.5  # largest mean difference of two copies of one image
+# Expected numbers of right matches.
+_ENOUGH_SIFT_MATCHES, _COUNTED_PRIOR = 100.0, 0.3  # above which LightGlue is left out; least probability that counts
+_MIRROR_EVIDENCE = 60.0  # least number of matches with a mirror image
+_MIRROR_RATIO = 1.5  # least ratio to that with the picture itself; symmetric things match either way
+# Learned matches of one pair of faces depend on each other, so that each counts less than its probability.
+_LEARNED_PRIOR, _LEARNED_NOISE, _LEARNED_SIZE = 0.7, 1.6e-3, 7.0  # largest prior; noise, radians; size, pixels
 _MAX_BASELINE = 1e9  # metres
-_LEAST_NEAR, _LARGEST_NEAR = 0.1, 0.6  # metres; the depth range is not narrower than that of rooms
-_MIN_FAR = 6.0
+_LEAST_NEAR, _LARGEST_NEAR, _MIN_FAR = 0.1, 0.6, 6.0  # metres; the depth range is not narrower than that of rooms
 _ADVICE = (
     "take one more photograph between those that share too little, or in the open door, or place them by hand in "
     "pansplat-view"
@@ -117,17 +117,17 @@ class PoseEstimate:
 
     Attributes:
         images: the files that were read.
-        groups: of panoramas that reliable pairs connect, the largest one first; each has a world of its own.
+        groups: panoramas that reliable pairs connect, the largest group first; each has a world of its own.
         unplaced: the reason for each file without a pose.
-        relations: of the pairs that were compared, by indices into `images`.
-        names: of the files, for messages; by default their own.
+        relations: relative poses of the pairs that were compared.
+        names: what messages call the files; by default their own names.
         approximate: about where files without a pose are, by links.
     """
 
     images: tuple[Path, ...]
     groups: tuple[PoseGroup, ...]
     unplaced: dict[Path, str]
-    relations: dict[IndexPair, RelativePose]
+    relations: dict[tuple[Path, Path], RelativePose]
     names: Mapping[Path, str] = field(default_factory=dict)
     approximate: Mapping[Path, LinkedPlace] = field(default_factory=dict)
 
@@ -160,6 +160,8 @@ class PoseEstimate:
         probable = sum(not relation.is_certain for relation in used)
         placed = sum(len(group.poses) for group in self.groups)
         groups = f" in {len(self.groups)} groups" if len(self.groups) > 1 else ""
+        if not self.groups:
+            return "no panorama has a pose"
         residual = max(group.residual for group in self.groups)
         return (
             f"{placed} of {len(self.images)} panoramas have a pose{groups}, by {describe_count(len(used), 'pair')}"
@@ -173,13 +175,13 @@ class _View:
     """What is used of a panorama.
 
     Attributes:
-        features: by SIFT, of faces along the camera's axes.
+        features: SIFT on faces along the camera's axes.
         turned: the same, of faces turned against the walls.
-        learned: by the learned matcher.
+        learned: features of the learned matcher.
         axes: gravity and walls.
         small: grey, for the search of the floor.
         surroundings: all that it shows, with estimated depth.
-        picture_hash, key: hashes of the grey panorama, and of all that this was computed from.
+        key: hash of all that this was computed from.
     """
 
     features: Features
@@ -188,7 +190,6 @@ class _View:
     axes: SceneAxes
     small: Float[Array, "height width"]
     surroundings: Surroundings
-    picture_hash: str = ""
     key: str = ""
 
     @functools.cached_property
@@ -234,7 +235,7 @@ def estimate_poses(
         images: files, 2:1; one that is repeated is used once.
         masks: the mask file of each image, if it has one; by default those beside the images (docs/input.md).
         links: for an image, the yaw at which a tour links to other images, radians to the right of the centre.
-        names: of the images, for messages; by default those of the files.
+        names: what messages call the images; by default the names of the files.
         camera_height: mean height of the cameras over the floor, metres; it sets the scale if the floor is found.
         baseline: two of the images of the largest group and their distance in metres, instead of the camera's height.
         cache_folder: folder whose cache keeps features and relative poses, so that a further panorama costs its own
@@ -262,21 +263,21 @@ def estimate_poses(
                 f"`baseline` must be two different images and a distance above 0 to {_MAX_BASELINE:g} metres, got "
                 f"{' '.join(map(str, baseline))}"
             )
-    pixels, unplaced = _read_images(paths, names)
-    kept = [n for n in range(len(paths)) if n not in unplaced]
+    pixels, reasons = _read_images(paths, names)
+    kept = list(pixels)
     if len(kept) < 2:
-        raise _no_poses(paths, names, unplaced | {n: "no other panorama is left" for n in kept})
+        raise _no_poses(paths, reasons | dict.fromkeys(kept, "no other panorama is left"), names)
     with one_thread():  # panoramas and pairs are divided among threads
-        files = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
+        masks = {path: find_mask(path, path.parent) for path in paths} if masks is None else masks
         cache = Store(cache_folder, _CACHED)
         count = len(kept)
         matcher = load_matcher(choose_device("learned matcher", count * _MATCHER_SECONDS))
         split = 0.9 * count / (count + _PAIR_TIME * min(count * (count - 1) / 2, count * _THOROUGH / 2))
         with stage(split):
-            views = _describe_views(paths, files, pixels, kept, matcher, cache)
+            views = _describe_views(pixels, masks, matcher, cache)
         links = links or {}
         yaws = {
-            (i, j): LinkDirections(links.get(paths[a], {}).get(paths[b]), links.get(paths[b], {}).get(paths[a]))
+            (i, j): LinkDirections(links.get(a, {}).get(b), links.get(b, {}).get(a))
             for (i, a), (j, b) in itertools.combinations(enumerate(kept), 2)
         }
         with stage(0.9):
@@ -285,21 +286,20 @@ def estimate_poses(
     downs = np.stack([v.axes.axes[0] if v.axes.has_down else np.full(3, np.nan) for v in views])
     noise = max(float(np.median(v.features.noise)) if len(v.features) else 0.0 for v in views)
     tour = build_tour([v.joined for v in views], relations, downs, noise)
-    placed, listed = [position for group in tour.groups for position in group.placed], [names[paths[n]] for n in kept]
+    placed, listed = [position for group in tour.groups for position in group.placed], [names[path] for path in kept]
     for position, (reason, other, figures) in tour.unplaced.items():
         partner = "" if other is None else f" (it has most in common with {listed[other]})"
         if figures:
             say_detail(f"{listed[position]} and {listed[other]}", figures)
-        unplaced[kept[position]] = _describe_mirrored(position, views, placed, listed) or reason + partner
-    files = [paths[n] for n in kept]
+        reasons[kept[position]] = _describe_mirrored(position, views, placed, listed) or reason + partner
     if not tour.groups:
-        raise _no_poses(paths, names, unplaced, _place_linked(views, files, links, ()))
+        raise _no_poses(paths, reasons, names, _place_linked(views, kept, links, ()))
     report_progress("finding the floor", 0.95)
     groups = [
         _finish_group(
             group,
             level_poses(group.poses, downs[list(group.placed)]),
-            [paths[kept[position]] for position in group.placed],
+            [kept[position] for position in group.placed],
             [views[position].small for position in group.placed],
             names,
             camera_height,
@@ -310,10 +310,10 @@ def estimate_poses(
     return PoseEstimate(
         paths,
         tuple(groups),
-        {paths[n]: unplaced[n] for n in sorted(unplaced)},
+        {path: reasons[path] for path in paths if path in reasons},
         {(kept[i], kept[j]): relation for (i, j), relation in (relations | tour.confirmed).items()},
         names,
-        _place_linked(views, files, links, groups),
+        _place_linked(views, kept, links, groups),
     )
 
 
@@ -378,39 +378,39 @@ class NoPosesError(InputError):
 
 def _no_poses(
     paths: Sequence[Path],
+    reasons: Mapping[Path, str],
     names: Mapping[Path, str],
-    reasons: Mapping[int, str],
     approximate: Mapping[Path, LinkedPlace] | None = None,
 ) -> NoPosesError:
-    return NoPosesError({paths[n]: reasons[n] for n in sorted(reasons)}, names, approximate)
+    return NoPosesError({path: reasons[path] for path in paths}, names, approximate)
 
 
 def _read_images(
     paths: Sequence[Path], names: Mapping[Path, str]
-) -> tuple[dict[int, UInt8[Array, "height width"]], dict[int, str]]:
-    """Grey panoramas by index, and the reasons against those that cannot be used."""
-    pixels: dict[int, Array] = {}
-    reasons: dict[int, str] = {}
-    thumbnails: dict[int, Array] = {}
-    for n, path in enumerate(paths):
+) -> tuple[dict[Path, UInt8[Array, "height width"]], dict[Path, str]]:
+    """Grey panoramas, and the reasons against those that cannot be used."""
+    pixels: dict[Path, Array] = {}
+    reasons: dict[Path, str] = {}
+    thumbnails: dict[Path, Array] = {}
+    for path in paths:
         try:
             image = read_panorama(path, _working_height(path))[0].numpy()
         except InputError as error:
-            reasons[n] = str(error).removeprefix(f"{path}: ").rstrip(".")
+            reasons[path] = str(error).removeprefix(f"{path}: ").rstrip(".")
             continue
         grey = cv2.cvtColor((image.transpose(1, 2, 0) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, (128, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
-        copy = next((m for m, other in thumbnails.items() if np.abs(small - other).mean() < _SAME_IMAGE), None)
+        copy = next((name for name, other in thumbnails.items() if np.abs(small - other).mean() < _SAME_IMAGE), None)
         if grey.mean() < _BLANK_BRIGHTNESS:
-            reasons[n] = f"too dark (mean grey value {grey.mean():.0f} of 255)"
+            reasons[path] = f"too dark (mean grey value {grey.mean():.0f} of 255)"
         elif small.std() < 2:
-            reasons[n] = "it shows nothing (one colour)"
+            reasons[path] = "it shows nothing (one colour)"
         elif not _is_closed(grey):
-            reasons[n] = "it is not a panorama of 360 degrees: its left and right edges do not join"
+            reasons[path] = "it is not a panorama of 360 degrees: its left and right edges do not join"
         elif copy is not None:
-            reasons[n] = f"it is a copy of {names[paths[copy]]}, or was taken at the same place"
+            reasons[path] = f"it is a copy of {names[copy]}, or was taken at the same place"
         else:
-            pixels[n], thumbnails[n] = grey, small
+            pixels[path], thumbnails[path] = grey, small
     return pixels, reasons
 
 
@@ -429,44 +429,40 @@ def _working_height(path: Path) -> int:
 
 
 def _describe_views(
-    paths: Sequence[Path],
+    pixels: Mapping[Path, UInt8[Array, "height width"]],
     masks: Mapping[Path, Path | None],
-    pixels: dict[int, Array],
-    kept: Sequence[int],
     matcher: Matcher,
     cache: Store,
 ) -> list[_View]:
-    hashes = {n: hash_parts(fingerprint_estimates(), pixels[n]) for n in kept}
-    static = _find_scene_mask([paths[n] for n in kept], list(hashes.values()), cache)
+    hashes = {path: hash_parts(fingerprint_estimates(), grey) for path, grey in pixels.items()}
+    static = _find_scene_mask(hashes, cache)
 
-    def look_up(n: int) -> _View:
-        mask = masks.get(paths[n])
+    def look_up(path: Path) -> _View:
+        mask = masks.get(path)
         scene = static if mask is None else read_mask(mask, _HEIGHT).numpy()
-        grey = pixels[n]
         # Read again: a float image has 25 MB, too many to keep those of all panoramas.
-        pixels_of_view, opaque = read_panorama(paths[n], len(grey))
+        pixels_of_view, opaque = read_panorama(path, len(pixels[path]))
         if not opaque.all():
             scene = scene & (cv2.resize(opaque.numpy().astype(np.uint8), scene.shape[::-1]) > 0)
         image = pixels_of_view.permute(1, 2, 0).numpy()
-        key = hash_parts(hashes[n], image, np.packbits(scene))
-        return cache.get("view", key, lambda: describe(n, key, scene, image))
+        key = hash_parts(hashes[path], image, np.packbits(scene))
+        return cache.get("view", key, lambda: describe(path, key, scene, image))
 
-    def describe(n: int, key: str, scene: Array, image: Array) -> _View:
-        grey = pixels[n]
+    def describe(path: Path, key: str, scene: Array, image: Array) -> _View:
+        grey = pixels[path]
         small = cv2.resize(grey, (2 * FLOOR_HEIGHT, FLOOR_HEIGHT), interpolation=cv2.INTER_AREA) / np.float32(255)
         axes = find_axes(grey)
         turned = detect_features(grey, scene, rotations=axes.frame @ DIAGONAL @ FACE_ROTATIONS, faces=4)
         learned = detect_learned(matcher, (image * 255).astype(np.uint8), scene, axes.frame)
         shown = cv2.resize(image, (2 * DEPTH_HEIGHT, DEPTH_HEIGHT), interpolation=cv2.INTER_AREA)
         depth = estimate_depth(shown, axes.axes[0] if axes.has_down else None)
-        surroundings = Surroundings(shown, depth)
-        return _View(detect_features(grey, scene), turned, learned, axes, small, surroundings, hashes[n], key)
+        return _View(detect_features(grey, scene), turned, learned, axes, small, Surroundings(shown, depth), key)
 
     views = []
     with worker_threads() as pool:
-        for position, view in enumerate(pool.map(look_up, kept)):
+        for view in pool.map(look_up, pixels):
             views.append(view)
-            report_progress("finding features", (position + 1) / len(kept))
+            report_progress("finding features", len(views) / len(pixels))
     return views
 
 
@@ -475,7 +471,7 @@ class _SceneMask:
     """Where panoramas show the scene and not what is fixed to the camera.
 
     Attributes:
-        hashes: of the grey panoramas.
+        hashes: hashes of the grey panoramas.
         bits: the mask, packed.
     """
 
@@ -486,20 +482,19 @@ class _SceneMask:
 _CACHED = (_View, _SceneMask, Features, LearnedFeatures, SceneAxes, Surroundings, DepthMap, RelativePose, Hypotheses)
 
 
-def _find_scene_mask(paths: Sequence[Path], hashes: Sequence[str], cache: Store) -> Bool[Array, "height width"]:
+def _find_scene_mask(hashes: Mapping[Path, str], cache: Store) -> Bool[Array, "height width"]:
     """Where the panoramas show the scene; as found before, if most of them are those of before.
 
     So the features of these stay when others are added.
     """
 
     def detect() -> _SceneMask:
-        mask = scene_mask_of_files(tuple(paths), _HEIGHT).numpy()
-        return _SceneMask(tuple(hashes), np.packbits(mask))
+        return _SceneMask(tuple(hashes.values()), np.packbits(scene_mask_of_files(tuple(hashes), _HEIGHT).numpy()))
 
-    earlier = [mask for mask in cache.list_values("mask") if set(mask.hashes) <= set(hashes)]
+    earlier = [mask for mask in cache.list_values("mask") if set(mask.hashes) <= set(hashes.values())]
     best = max(earlier, key=lambda mask: len(mask.hashes), default=None)
     if best is None or len(best.hashes) < _MASK_KEPT_SHARE * len(hashes):
-        best = cache.get("mask", hash_parts(*hashes), detect)
+        best = cache.get("mask", hash_parts(*hashes.values()), detect)
     return np.unpackbits(best.bits, count=2 * _HEIGHT**2).reshape(_HEIGHT, 2 * _HEIGHT).astype(bool)
 
 
@@ -544,7 +539,7 @@ def _relate_views(
         key = hash_parts(first.key, second.key, str(links[pair]))
         return cache.get("pair", key, lambda: relate(pair))
 
-    groups, counts = list(range(len(views))), [0] * len(views)  # by certain pairs
+    groups, counts = list(range(len(views))), [0] * len(views)  # what certain pairs connect; certain pairs of each view
 
     def is_needed(pair: IndexPair) -> bool:
         i, j = pair
@@ -614,7 +609,7 @@ def _is_mirrored(
 
     Args:
         overlap: `_quick_overlap` of both, if known.
-        relation: of both; the mirror image must fit better.
+        relation: relative pose of both; the mirror image must fit better.
     """
     mirrored = first.mirrored
     evidence = _quick_overlap(mirrored.features, second.features)

@@ -25,12 +25,12 @@ from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.poses.solvers import compiled
 
-_FIELD_OF_VIEW = 100.0  # degrees of a face; 10 more than a cube's
+_FIELD_OF_VIEW = 100.0  # angle of a face, degrees; 10 more than a cube's
 _CONTRAST, _EDGE = 0.015, 12.0  # thresholds of SIFT; low, because matching removes weak features
-_FEATURES = 8000  # of a panorama, at most
+_FEATURES = 8000  # largest number for a panorama
 _DIM_BRIGHTNESS = 16.0  # mean grey value below which an image is brightened
-_REPEATED_MATCH = 0.008  # distance of matches that count once, radians in both panoramas together
-_NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # of a right match's epipolar angle: pixels at the horizon; radians
+_REPEATED_MATCH = 0.008  # nearer matches count once, radians in both panoramas together
+_NOISE_PIXELS, _MIN_NOISE = 0.45, 8e-4  # noise of a right match's epipolar angle: pixels at the horizon; radians
 # Prior probability that a match is right, by its ratio; measured on pairs of real panoramas 2 to 3 m apart.
 _RATIOS, _PRIORS = (0.5, 0.65, 0.75, 0.8, 0.85, 0.9, 1.0), (0.8, 0.6, 0.3, 0.15, 0.06, 0.02, 0.005)
 _CHUNK = 256  # descriptors that are compared together
@@ -90,7 +90,7 @@ class Matches:
     """Pairs of features, the most probable first.
 
     Attributes:
-        indices: of the features in the first and in the second panorama.
+        indices: numbers of the features in the first and in the second panorama.
         prior: probability of each match to be right, before any pose is known.
     """
 

@@ -22,18 +22,13 @@ from pansplat.inputs.poses import rigid_matrix, to_cam2world
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.poses.edit import POSES, find_kept, merge_estimate, name_pictures, read_pose_content, write_pose_file
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, estimate_poses, fingerprint_estimates
-from pansplat.poses.pose_file import (
-    CONVENTION,
-    list_approximate,
-    make_pose_content,
-    make_world,
-)
+from pansplat.poses.pose_file import CONVENTION, make_pose_content, matrix_of, world_of
 from pansplat.system.descriptions import list_first
 from pansplat.system.files import require_replaceable
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 
-_KIND = "poses"  # of entries of the store
+_KIND = "poses"  # what the store calls estimated poses
 
 
 def require_mergeable(path: Path, images: Sequence[Path], *, overwrite: bool) -> None:
@@ -125,10 +120,10 @@ def estimate_sets(
     read.
 
     Args:
-        folder: of the tour.
+        folder: the folder of the tour.
         panoramas: two or more, of unique names.
         near, far: metres; they override the estimated range.
-        camera_height: of the cameras over the floor, metres.
+        camera_height: height of the cameras over the floor, metres.
         on_unposed: called before poses are estimated, if none are cached, with a pair of a single view for each
             panorama.
     """
@@ -146,25 +141,18 @@ def estimate_sets(
 
 
 def _estimate(folder: Path, panoramas: Sequence[Panorama], camera_height: float) -> dict[str, Any]:
-    """What is cached: worlds of placed panoramas, and the reasons for the others, by name."""
+    """What is cached: the content of a poses.json by names, also if no panorama is placed; and unreadable ones."""
     names = {panorama.image: panorama.name for panorama in panoramas}
     try:
         estimate = estimate_panoramas(folder, panoramas, camera_height=camera_height)
     except NoPosesError as error:
-        worlds, summary, unplaced, approximate = [], "", error.reasons, error.approximate
-    else:
-        worlds = [make_world(group, names) for group in estimate.groups]
-        summary, unplaced, approximate = estimate.summary, estimate.unplaced, estimate.approximate
-    unreadable = [image for image in unplaced if not _is_readable(image)]
+        estimate = PoseEstimate(tuple(names), (), error.reasons, {}, approximate=error.approximate)
+    unreadable = [image for image in estimate.unplaced if not _is_readable(image)]
     if len(unreadable) == len(panoramas):
-        raise NoPosesError(unplaced)
-    return {
-        "worlds": worlds,
-        "summary": summary,
-        "unplaced": {names[image]: reason for image, reason in unplaced.items()},
-        "unreadable": [names[image] for image in unreadable],
-        "approximate": list_approximate(approximate, names),
-    }
+        raise NoPosesError(estimate.unplaced)
+    content = make_pose_content(estimate, names)
+    content["estimate"]["unplaced"] = {names[image]: reason for image, reason in estimate.unplaced.items()}
+    return content | {"unreadable": [names[image] for image in unreadable]}
 
 
 def _is_readable(image: Path) -> bool:
@@ -185,41 +173,36 @@ def _make_pairs(
 ) -> list[PanoramaSet]:
     """The pairs of an estimate, with its warnings."""
     by_name = {panorama.name: panorama for panorama in panoramas}
-    unplaced, unreadable = content["unplaced"], content["unreadable"]
-    if content["worlds"]:
+    worlds, stated, unreadable = content["worlds"], content["estimate"], content["unreadable"]
+    if worlds:
         advice = ""
         with contextlib.suppress(InputError):
             name_pictures(folder / POSES, [panorama.image for panorama in panoramas])
             advice = f" `pansplat pose {folder} -o {folder / POSES}` writes them to a file."
-        warnings.warn(f"{folder} has no poses; they were estimated: {content['summary']}.{advice}", stacklevel=4)
-    for name, reason in unplaced.items():
-        panorama = by_name[name]
+        warnings.warn(f"{folder} has no poses; they were estimated: {stated['summary']}.{advice}", stacklevel=4)
+    for name, reason in stated["unplaced"].items():
         outcome = "cannot be read and is left out" if name in unreadable else "has no pose and is a scene of its own"
-        warnings.warn(f"{_describe(panorama, folder)} {outcome}: {reason}", InputWarning, stacklevel=4)
+        warnings.warn(f"{_describe(by_name[name], folder)} {outcome}: {reason}", InputWarning, stacklevel=4)
+    posed: list[list[Panorama]] = [[] for _ in worlds]
+    for name, entry in content["poses"].items():
+        pose, world = to_cam2world(rigid_matrix(matrix_of(entry), str(source)), CONVENTION), world_of(entry)
+        placement = Placement(source=source)
+        posed[world].append(replace(by_name[name], cam2world=pose, world=world, placement=placement))
     pairs = []
-    units = {name: world["unit"] for world in content["worlds"] for name in world["poses"]}
-    about = read_approximate(content, {name: view.image for name, view in by_name.items()}, units)
-    for number, world in enumerate(content["worlds"]):
-        placed = tuple(
-            replace(
-                by_name[name],
-                cam2world=to_cam2world(rigid_matrix(pose, str(source)), CONVENTION),
-                world=number,
-                placement=Placement(source=source),
-            )
-            for name, pose in world["poses"].items()
-        )
-        only = folder.resolve().name if len(placed) == 2 else None
-        found = Collection(source or folder, folder, placed, near=world["near"], far=world["far"], name=only)
+    for views, world in zip(posed, worlds, strict=True):
+        only = folder.resolve().name if len(views) == 2 else None
+        found = Collection(source or folder, folder, tuple(views), near=world["near"], far=world["far"], name=only)
         pairs += found.sets(near, far)
+    units = {view.name: world["unit"] for views, world in zip(posed, worlds, strict=True) for view in views}
+    about = read_approximate(stated, {name: view.image for name, view in by_name.items()}, units)
     readable = [panorama for panorama in panoramas if panorama.name not in unreadable]
+    reasons = stated["unplaced"]
     single = [
-        replace(view, placement=Placement("not placed", unplaced[view.name], source, about=about.get(view.image)))
+        replace(view, placement=Placement("not placed", reasons[view.name], source, about=about.get(view.image)))
         for view in readable
-        if view.name in unplaced
+        if view.name in reasons
     ]
-    first_world = len(content["worlds"])
-    return pairs + single_view_sets(single, folder, near, far, siblings=readable, first_world=first_world)
+    return pairs + single_view_sets(single, folder, near, far, siblings=readable, first_world=len(worlds))
 
 
 def _describe(panorama: Panorama, folder: Path) -> str:

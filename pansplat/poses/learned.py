@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -29,13 +28,13 @@ from pansplat.networks.lightglue import LightGlue
 from pansplat.networks.weights import load_weights, require_shapes
 from pansplat.poses.features import FACE_ROTATIONS, Matches, are_distinct, render_face
 
-_FACES = 4  # the horizontal ones; floor and ceiling have few keypoints, and no upright direction
-_KEYPOINTS = 640  # of a face
+_FACES = 4  # horizontal ones; floor and ceiling have few keypoints, and no upright direction
+_KEYPOINTS = 640  # largest number for a face
 _STRIDE = 32  # pixels; the sides of an image are multiples of it
-_FACE_PAIRS = 6  # that LightGlue matches: those with most distinctive descriptors in common
+_FACE_PAIRS = 6  # LightGlue matches so many pairs of faces: those with most distinctive descriptors in common
 _DISTINCT_RATIO = 0.85  # largest ratio of distances to the nearest and the second nearest descriptor
-_MIN_SCORE, _MAX_SCORE = 0.1, 0.9995  # of a match that is used; in the calibration
-_CONFIDENT = 0.3  # score of matches that count for their pair of faces
+_MIN_SCORE, _MAX_SCORE = 0.1, 0.9995  # least score of a match that is used; largest one in the calibration
+_CONFIDENT = 0.3  # matches of a higher score count for their pair of faces
 # Log-odds that a match is right: constant, per log-odds of its score, per logarithm of 1 + the sum of the confident
 # scores of its pair of faces. Logistic regression over the 78 pairs of a real home (docs/poses.md).
 _CALIBRATION = -4.84, 0.264, 1.586
@@ -77,14 +76,12 @@ class LearnedFeatures:
         descriptors: unit vectors.
         points: positions x, y on the face, -1 to 1.
         starts: index of each face's first feature, and the number of features.
-        pixel: angle of a face's pixel at its centre, radians.
     """
 
     bearings: Float[Array, "feature 3"]
     descriptors: Float[Tensor, "feature 128"]
     points: Float[Tensor, "feature 2"]
     starts: tuple[int, ...]
-    pixel: float
 
     def __len__(self) -> int:
         return len(self.bearings)
@@ -95,7 +92,7 @@ class LearnedFeatures:
         return self.points[own], self.descriptors[own]
 
 
-NO_LEARNED = LearnedFeatures(np.empty((0, 3)), torch.empty(0, 128), torch.empty(0, 2), (0,) * (_FACES + 1), 0.0)
+NO_LEARNED = LearnedFeatures(np.empty((0, 3)), torch.empty(0, 128), torch.empty(0, 2), (0,) * (_FACES + 1))
 
 
 def detect_learned(
@@ -117,7 +114,7 @@ def detect_learned(
         margin = len(pixels) % _STRIDE
         side = len(pixels) - margin
         pixels = pixels[margin // 2 :][:side, margin // 2 :][:, :side]
-        centre = len(pixels) / 2 + margin / 2 - margin // 2  # of the face, in pixels from the corner
+        centre = len(pixels) / 2 + margin / 2 - margin // 2  # pixels from the corner of the face
         inside = render_face(mask.astype(np.uint8), rotation, focal)[margin // 2 :][:side, margin // 2 :][:, :side]
         allowed = torch.from_numpy(inside > 0)
         with torch.inference_mode():
@@ -130,40 +127,32 @@ def detect_learned(
         descriptors.append(described)
         places.append((points - side / 2) / (side / 2))
         starts.append(starts[-1] + len(points))
-    return LearnedFeatures(
-        np.concatenate(bearings), torch.cat(descriptors), torch.cat(places), tuple(starts), 2 * math.pi / image.shape[1]
-    )
+    return LearnedFeatures(np.concatenate(bearings), torch.cat(descriptors), torch.cat(places), tuple(starts))
 
 
 def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> Matches:
-    """Matches of two panoramas, whose prior is the probability that each is right."""
+    """Matches of two panoramas, whose prior is the probability that each is right.
+
+    A match that contradicts or repeats a more probable one is left out.
+    """
     common, device = count_common(first, second), next(matcher.parameters()).device
     order = np.argsort(-common, axis=None, kind="stable")[:_FACE_PAIRS]
-    found = []
+    indices, priors = [np.empty((0, 2), np.int64)], [np.empty(0)]
+    constant, by_score, by_support = _CALIBRATION
     for i, j in np.stack(np.unravel_index(order, common.shape), axis=1).tolist():
         with torch.inference_mode():
             faces = (tuple(each.to(device) for each in face) for face in (first.face(i), second.face(j)))
-            indices, scores = (each.cpu() for each in matcher.lightglue(*faces))
-        found.append((indices.numpy() + np.array((first.starts[i], second.starts[j])), scores.double().numpy()))
-    return _join_faces(first, second, found)
-
-
-def _join_faces(
-    first: LearnedFeatures, second: LearnedFeatures, found: Sequence[tuple[Int[Array, "_ 2"], Float[Array, "_"]]]
-) -> Matches:
-    """The matches of all pairs of faces, without those that contradict or repeat a more probable one."""
-    indices = np.concatenate([index for index, _ in found])
-    score = np.concatenate([score for _, score in found])
-    support = np.concatenate([np.full(len(score), score[score > _CONFIDENT].sum()) for _, score in found])
-    constant, by_score, by_support = _CALIBRATION
-    clipped = score.clip(_MIN_SCORE, _MAX_SCORE)
-    odds = constant + by_score * np.log(clipped / (1 - clipped)) + by_support * np.log1p(support)
-    probability = 1 / (1 + np.exp(-odds))
-    order = np.argsort(-probability, kind="stable")
-    order = order[score[order] > _MIN_SCORE]
-    a, b = first.bearings[indices[order, 0]], second.bearings[indices[order, 1]]
+            index, score = (each.cpu().double().numpy() for each in matcher.lightglue(*faces))
+        kept, clipped = score > _MIN_SCORE, score.clip(_MIN_SCORE, _MAX_SCORE)
+        support = math.log1p(float(score[score > _CONFIDENT].sum()))
+        odds = constant + by_score * np.log(clipped / (1 - clipped)) + by_support * support
+        indices.append((index[kept] + (first.starts[i], second.starts[j])).astype(np.int64))
+        priors.append(1 / (1 + np.exp(-odds[kept])))
+    index, prior = np.concatenate(indices), np.concatenate(priors)
+    order = np.argsort(-prior, kind="stable")
+    a, b = first.bearings[index[order, 0]], second.bearings[index[order, 1]]
     order = order[are_distinct(a) & are_distinct(b)]
-    return Matches(indices[order], probability[order])
+    return Matches(index[order], prior[order])
 
 
 def count_common(first: LearnedFeatures, second: LearnedFeatures) -> Int[Array, "face face"]:

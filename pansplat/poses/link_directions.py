@@ -9,15 +9,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-_NOISE, _RIGHT = math.radians(15), 0.85  # of a link, which is often on a door; share of right links
+_NOISE, _RIGHT = math.radians(15), 0.85  # deviation of a link, which is often on a door; share of right links
 
 
 class LinkDirections(NamedTuple):
     """Where a tour's links place the other panorama: yaw to the right of the centre column, radians; None without one.
 
     Attributes:
-        there: from the first panorama.
-        back: from the second panorama.
+        there: yaw of the link of the first panorama.
+        back: yaw of the link of the second panorama.
     """
 
     there: float | None = None

@@ -30,14 +30,14 @@ from pansplat.tours.floor import find_ceiling, trace_floor
 from pansplat.tours.linked_rooms import turn_plan
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
-_IMAGE_HEIGHT = 1024  # largest one, in which edges are looked for
-_OUTLINE_STEP = 2  # of the pixels that an outline is traced from, rows and columns
-_UPRIGHT = math.radians(8)  # between a world's y axis and the mean down of its cameras, if y is down
-_DOOR = math.radians(16)  # standard deviation of what counts in the direction of a door
-_LINTEL = 0.6, 0.95  # what is above doors and below the ceiling, fractions of the ceiling's height over the camera
-_WALL_TURN, _GRAZING = math.radians(25), 0.12  # of a surface and its wall; least cosine of a direction and a wall's
-_LEAST_WALL, _THICKNESS = 0.25, 0.08  # distance of a wall with a door, and its thickness, camera heights
-_ALIKE, _NO_DOOR = 7.65, 0.1  # weight of the likeness, as in the check of poses; weight of no common door
+_IMAGE_HEIGHT = 1024  # rows of the panorama in which edges are looked for, at most
+_OUTLINE_STEP = 2  # an outline is traced from every second row and column
+_UPRIGHT = math.radians(8)  # y is down in a world whose cameras' mean down is within this angle of it
+_DOOR = math.radians(16)  # surfaces around the direction of a door have a normal weight of this deviation
+_LINTEL = 0.6, 0.95  # heights above doors and below the ceiling, over that of the ceiling above the camera
+_WALL_TURN, _GRAZING = math.radians(25), 0.12  # surfaces of a wall turn less; least cosine of a link and a normal
+_LEAST_WALL, _THICKNESS = 0.25, 0.08  # least distance of a wall with a door, and its thickness, camera heights
+_ALIKE, _NO_DOOR = 7.65, 0.1  # weight of the likeness, as in the check of poses; weight that no door is common
 
 
 class PlanPose(NamedTuple):

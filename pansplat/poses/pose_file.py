@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +21,45 @@ CONVENTION = "cam2world opencv"
 
 def make_pose_content(estimate: PoseEstimate, names: Mapping[Path, str]) -> dict[str, Any]:
     """The content of a poses.json: the poses of all groups (a world each), and approximate places."""
-    worlds = [make_world(group, names) for group in estimate.groups]
-    return make_pose_file(
-        worlds,
-        {
-            "summary": estimate.summary,
-            "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
-            "approximate": list_approximate(estimate.approximate, names),
-        },
-    )
-
-
-def make_pose_file(worlds: Sequence[Mapping[str, Any]], estimate: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a poses.json from worlds as the cache keeps them."""
     poses = {}
-    for number, world in enumerate(worlds):
-        for name, pose in world["poses"].items():
-            poses[name] = {"cam2world": pose, "world": number} if number else pose
-    ranges = [{key: world[key] for key in ("near", "far", "unit")} for world in worlds]
-    content = {"convention": CONVENTION, "worlds": ranges, "poses": poses}
-    return content | {"estimate": {**estimate, "written": " ".join(mark_worlds(content).values())}}
+    for number, group in enumerate(estimate.groups):
+        for image, pose in group.poses.items():
+            matrix = np.round(pose, 9).tolist()
+            poses[names[image]] = {"cam2world": matrix, "world": number} if number else matrix
+    content: dict[str, Any] = {"convention": CONVENTION, "worlds": [*map(make_range, estimate.groups)], "poses": poses}
+    content["estimate"] = {
+        "summary": estimate.summary,
+        "unplaced": {image.name: reason for image, reason in estimate.unplaced.items()},
+        "approximate": list_approximate(estimate.approximate, names),
+        "written": _join_marks(content),
+    }
+    return content
+
+
+def rename_panoramas(content: Mapping[str, Any], names: Mapping[str, str], files: Mapping[str, str]) -> dict[str, Any]:
+    """The content of a poses.json, by other names of the panoramas.
+
+    Args:
+        content: as `make_pose_content` makes it.
+        names: the new one of each name.
+        files: the name of the file of each, for reasons.
+    """
+    renamed = {**content, "poses": {names.get(name, name): entry for name, entry in content["poses"].items()}}
+    estimate = content["estimate"]
+    renamed["estimate"] = {
+        **estimate,
+        "unplaced": {files.get(name, name): reason for name, reason in estimate["unplaced"].items()},
+        "approximate": [
+            about | {key: [names.get(name, name) for name in about[key]] for key in ("between", "by")}
+            for about in estimate["approximate"]
+        ],
+        "written": _join_marks(renamed),
+    }
+    return renamed
+
+
+def _join_marks(content: Mapping[str, Any]) -> str:
+    return " ".join(mark_worlds(content).values())
 
 
 def world_of(entry: Any) -> int:
@@ -85,11 +104,6 @@ def format_pose_file(content: Mapping[str, Any]) -> str:
 
 def _join_lines(match: re.Match[str]) -> str:
     return "[" + " ".join(match[1].split()) + "]"
-
-
-def make_world(group: PoseGroup, names: Mapping[Path, str]) -> dict[str, Any]:
-    poses = {names[image]: np.round(pose, 9).tolist() for image, pose in group.poses.items()}
-    return make_range(group) | {"poses": poses}
 
 
 def make_range(group: PoseGroup) -> dict[str, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,15 @@ def skew(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=-1).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def make_motion(
+    rotation: Float[Array, "*batch 3 3"], translation: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 4 4"]:
+    """Matrices of rigid motions x2 = R x1 + t."""
+    motion = np.zeros((*rotation.shape[:-2], 4, 4))
+    motion[..., :3, :3], motion[..., :3, 3], motion[..., 3, 3] = rotation, translation, 1
+    return motion
 
 
 def rotation_exp(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
@@ -140,7 +150,7 @@ def upright_from_three(
     t is perpendicular to the three vectors R a x b. Their determinant is a trigonometric polynomial of degree 3 in the
     angle of R.
     """
-    sample, angle = _trigonometric_roots(lambda yaw: np.linalg.det(_normals(a, b, yaw)), len(a), 3)
+    sample, angle = _trigonometric_roots(lambda yaw: np.linalg.det(_normals(a, b, yaw)))
     normals = _normals(a[sample], b[sample], angle[:, None])[:, 0]
     candidates = cross(normals[:, (0, 1, 2)], normals[:, (1, 2, 0)])
     length = np.linalg.norm(candidates, axis=-1)
@@ -148,26 +158,6 @@ def upright_from_three(
     rows = np.arange(len(best))
     usable = length[rows, best] > _MIN_SINE
     translation = candidates[rows, best][usable] / length[rows, best][usable][:, None]
-    return _yaw_rotations(angle[usable]), translation
-
-
-def upright_from_two(
-    a: Float[Array, "sample 2 3"], b: Float[Array, "sample 2 3"]
-) -> tuple[Float[Array, "solution 3 3"], Float[Array, "solution 3"]]:
-    """Relative poses (R, t) of upright cameras at the same height from two pairs of bearings each."""
-
-    def determinant(yaw: Array) -> Array:
-        n = _normals(a, b, yaw)
-        return n[..., 0, 0] * n[..., 1, 2] - n[..., 0, 2] * n[..., 1, 0]
-
-    sample, angle = _trigonometric_roots(determinant, len(a), 2)
-    normals = _normals(a[sample], b[sample], angle[:, None])[:, 0]
-    length = np.hypot(normals[..., 0], normals[..., 2])
-    best = length.argmax(axis=1)
-    rows = np.arange(len(best))
-    normal, norm = normals[rows, best], length[rows, best]
-    usable = norm > _MIN_SINE
-    translation = np.stack((-normal[:, 2], np.zeros(len(normal)), normal[:, 0]), axis=1)[usable] / norm[usable][:, None]
     return _yaw_rotations(angle[usable]), translation
 
 
@@ -182,11 +172,15 @@ def _normals(a: Array, b: Array, yaw: Array) -> Float[Array, "sample angle n 3"]
     return cross(rotated, b[:, None])
 
 
-def _trigonometric_roots(function, count: int, degree: int) -> tuple[Int[Array, "root"], Float[Array, "root"]]:
-    """Sample and angle of the roots of `count` trigonometric polynomials; `function` evaluates them at (1, n) angles.
+def _trigonometric_roots(function: Callable[[Array], Array]) -> tuple[Int[Array, "root"], Float[Array, "root"]]:
+    """Sample and angle of the roots of trigonometric polynomials of degree 3.
 
     Roots are sign changes on a regular grid, improved by Newton's method; pairs of nearly equal roots are missed.
+
+    Args:
+        function: evaluates all polynomials at (1, n) angles.
     """
+    degree = 3
     nodes = 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
     values = function(nodes[None])  # (count, nodes)
     orders = np.arange(1, degree + 1)

@@ -1,10 +1,9 @@
 """Poses of many panoramas from the relative poses of their pairs.
 
 Each relation states a rotation, a direction and, by the estimated depths, a distance in camera heights. Relations that
-contradict the others around triangles are left out. The others connect the panoramas in groups. A group grows from its
-best pair: the panorama with the strongest relations to the placed ones is added where most of them place it, and all
-poses are adjusted together. Groups and single panoramas are then joined where the hypotheses of several pairs between
-them agree, or one is probable enough by itself.
+contradict the others around triangles are left out. The others connect the panoramas in groups. The strongest relations
+place a group, and all its poses are adjusted together. Groups and single panoramas are then joined where the
+hypotheses of several pairs between them agree, or one is probable enough by itself.
 """
 
 from __future__ import annotations
@@ -16,28 +15,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 
 from pansplat.poses.bundle import Bundle, adjust, point_depths, residual_angles, triangulate
 from pansplat.poses.features import Features
-from pansplat.poses.solvers import rotation_angle
+from pansplat.poses.solvers import make_motion, rotation_angle
 from pansplat.poses.two_view import RelativePose
 from pansplat.system.components import label_components
 
 IndexPair = tuple[int, int]
 
-_LARGEST_LOOP = math.radians(4)  # rotation around a triangle of right pairs
-_LARGEST_GAP = 0.15  # of the translations around it, relative to their length
-_JOINED_ODDS = 1.0  # logarithm of the odds of a junction of two groups
+_LARGEST_LOOP = math.radians(4)  # right pairs of a triangle turn by less around it
+_LARGEST_GAP = 0.15  # and their translations leave a smaller gap, relative to their length
+_JOINED_ODDS = 1.0  # groups are joined above this logarithm of the odds
 _AGREEMENT = 1.5  # logarithm: how much rarer hypotheses of two pairs agree if they are wrong; neighbours look alike
-_LEAST_ODDS = -9.0  # of a hypothesis
-_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # of agreeing ones; gaps in camera heights, and relative
-_RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # least differences of junctions that exclude each other
-_AGREEING_PLACES = 0.2  # distance of two places of a panorama that confirm each other, relative to its own distance
-_OUTLIER = 8.0  # residual of an observation that is left out, in the noise's standard deviation
-_FEW_JOINT = 40  # points with two other panoramas, below which estimated distances count in the adjustment
-_ROUNDS = 3  # of adjustment and removal of outliers
+_LEAST_ODDS = -9.0  # hypotheses with a lower logarithm of the odds are left out
+_JOINED_TURN, _JOINED_GAP = math.radians(4), (0.25, 0.1)  # agreeing hypotheses are nearer: camera heights, or relative
+_RIVAL_TURN, _RIVAL_GAP = math.radians(6), (0.5, 0.2)  # junctions that differ by more exclude each other
+_OUTLIER = 8.0  # an observation with a larger residual is left out, in the noise's standard deviation
+_FEW_JOINT = 40  # with fewer points that three panoramas see, estimated distances count in the adjustment
+_ROUNDS = 3  # the poses are adjusted so often, each time without the outliers
 _NONE_SHOWS_IT = "no other photograph shows this room{}: take one in the doorway"
 _REASONS = {  # by the problem of the best pair, without its figures
     "": "it seems to be at another place than other photographs state: take one more near it",
@@ -89,8 +87,8 @@ def build_tour(
     """Poses of all panoramas that reliable pairs connect.
 
     Args:
-        features: of all panoramas.
-        relations: of the pairs (i, j), i < j, that were compared.
+        features: features of all panoramas.
+        relations: relative poses of the pairs (i, j), i < j, that were compared.
         downs: gravity in each camera's frame; NaN where unknown.
         noise: standard deviation of a bearing, radians.
     """
@@ -113,11 +111,11 @@ def _place_groups(
     features: Sequence[Features], relations: Mapping[IndexPair, RelativePose], downs: Array, noise: float
 ) -> list[Group]:
     """The groups of panoramas that relations connect."""
-    groups = []
-    for members in _connect(len(features), relations):
-        own = {pair: relation for pair, relation in relations.items() if pair[0] in members}
-        groups.append(_place_group(features, own, downs, noise))
-    return groups
+    parts: dict[int, dict[IndexPair, RelativePose]] = {}
+    labels = label_components(len(features), relations)
+    for pair, relation in relations.items():
+        parts.setdefault(labels[pair[0]], {})[pair] = relation
+    return [_place_group(features, parts[label], downs, noise) for label in sorted(parts)]
 
 
 _Part = dict[int, Float[Array, "4 4"]]
@@ -157,7 +155,8 @@ def _find_junction(
     """
     between = []
     for (i, j), relation in relations.items():
-        motions, odds = _hypotheses(relation)
+        likely = relation.hypotheses.log_odds > _LEAST_ODDS
+        motions, odds = relation.hypotheses.motions[likely], relation.hypotheses.log_odds[likely]
         if i in first and j in second:
             between.append((i, j, motions, odds))
         elif j in first and i in second:
@@ -180,15 +179,6 @@ def _find_junction(
     return float(evidence[best] - np.logaddexp.reduce(np.append(rivals, 0.0))), found[best]
 
 
-def _hypotheses(relation: RelativePose) -> tuple[Float[Array, "n 4 4"], Float[Array, "n"]]:
-    """Motions from the first camera's frame to the second one's, and the logarithms of their odds."""
-    known = relation.hypotheses
-    likely = known.log_odds > _LEAST_ODDS
-    motions = np.tile(np.eye(4), (int(likely.sum()), 1, 1))
-    motions[:, :3, :3], motions[:, :3, 3] = known.rotations[likely], known.translations[likely]
-    return motions, known.log_odds[likely]
-
-
 def _agree(
     first: Float[Array, "n 4 4"], second: Float[Array, "m 4 4"], turn: float, gap: tuple[float, float]
 ) -> Bool[Array, "n m"]:
@@ -207,9 +197,7 @@ def _confirm(parts: Sequence[_Part], relations: Mapping[IndexPair, RelativePose]
         for (i, j), relation in relations.items():
             if i in part and j in part and relation.is_doubtful and relation.is_matched:
                 motion = np.linalg.inv(part[j]) @ part[i]
-                own = np.eye(4)
-                own[:3, :3], own[:3, 3] = relation.rotation, relation.distance * relation.translation
-                if _agree(motion[None], own[None], _JOINED_TURN, _JOINED_GAP)[0, 0]:
+                if _agree(motion[None], relation.motion[None], _JOINED_TURN, _JOINED_GAP)[0, 0]:
                     confirmed[i, j] = replace(relation, problem=None)
     return confirmed
 
@@ -232,19 +220,10 @@ def _closes(kept: Mapping[IndexPair, RelativePose], relation: RelativePose, pair
     first, second = _motion_between(kept, pair[0], k), _motion_between(kept, k, pair[1])
     if first is None or second is None:
         return None
-    turn = float(rotation_angle(second[0] @ first[0] @ relation.rotation.T))
-    translation = second[0] @ first[1] + second[1]
-    length = relation.distance + float(np.linalg.norm(first[1]) + np.linalg.norm(second[1]))
-    gap = float(np.linalg.norm(translation - relation.distance * relation.translation))
-    return turn < _LARGEST_LOOP and gap < _LARGEST_GAP * length
-
-
-def _connect(count: int, relations: Mapping[IndexPair, RelativePose]) -> list[set[int]]:
-    """The sets of two or more panoramas that relations connect."""
-    sets: dict[int, set[int]] = {}
-    for view, label in enumerate(label_components(count, relations)):
-        sets.setdefault(label, set()).add(view)
-    return [members for members in sets.values() if len(members) > 1]
+    around, own = second @ first, relation.motion
+    turn = float(rotation_angle(around[:3, :3] @ own[:3, :3].T))
+    length = sum(float(np.linalg.norm(motion[:3, 3])) for motion in (own, first, second))
+    return turn < _LARGEST_LOOP and float(np.linalg.norm(around[:3, 3] - own[:3, 3])) < _LARGEST_GAP * length
 
 
 def _place_group(
@@ -253,17 +232,21 @@ def _place_group(
     downs: Float[Array, "view 3"],
     noise: float,
 ) -> Group:
-    growing = _GrowingGroup(_make_tracks(features, relations), relations, downs, noise)
-    growing.grow()
-    bundle, placed = growing.with_distances(), growing.placed
+    """The group that relations connect: placed by a tree of the strongest ones, then adjusted together."""
+    poses = {min(relations)[0]: np.eye(4)}
+    while leaving := [pair for pair in relations if (pair[0] in poses) != (pair[1] in poses)]:
+        i, j = max(leaving, key=lambda pair: (relations[pair].log_odds, relations[pair].score))
+        if i in poses:
+            poses[j] = poses[i] @ np.linalg.inv(relations[i, j].motion)
+        else:
+            poses[i] = poses[j] @ relations[i, j].motion
+    placed = tuple(sorted(poses))
+    bundle = _make_bundle(features, relations, placed, np.stack([poses[view] for view in placed]), downs)
     for _ in range(_ROUNDS if len(placed) > 2 else 1):
         if len(placed) > 2:
             bundle = adjust(bundle, noise)
         bundle = bundle.select(residual_angles(bundle) < _OUTLIER * noise)
-    poses = np.tile(np.eye(4), (len(placed), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = bundle.rotations, bundle.centres
-    order = np.argsort(placed)
-    return Group(tuple(int(placed[i]) for i in order), poses[order], point_depths(bundle), residual_angles(bundle))
+    return Group(placed, make_motion(bundle.rotations, bundle.centres), point_depths(bundle), residual_angles(bundle))
 
 
 def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) -> tuple[str, int | None, str]:
@@ -296,127 +279,47 @@ def _find_contradictions(relations: Mapping[IndexPair, RelativePose]) -> tuple[I
     return tuple(rejected)
 
 
-def _motion_between(
-    kept: Mapping[IndexPair, RelativePose], i: int, j: int
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"]] | None:
-    """Rotation and translation, camera heights, from one camera to another one."""
-    if (i, j) in kept:
-        return kept[i, j].rotation, kept[i, j].distance * kept[i, j].translation
-    if (j, i) in kept:
-        back = kept[j, i].rotation.T
-        return back, -kept[j, i].distance * back @ kept[j, i].translation
-    return None
+def _motion_between(known: Mapping[IndexPair, RelativePose], i: int, j: int) -> Float[Array, "4 4"] | None:
+    """The motion from one camera's frame to another one's, camera heights; None if it is not known."""
+    if (i, j) in known:
+        return known[i, j].motion
+    return np.linalg.inv(known[j, i].motion) if (j, i) in known else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Observations:
-    """Observations of tracks: panorama, track and bearing; at most one for each panorama and track."""
+def _make_bundle(
+    features: Sequence[Features],
+    relations: Mapping[IndexPair, RelativePose],
+    placed: Sequence[int],
+    poses: Float[Array, "placed 4 4"],
+    downs: Float[Array, "view 3"],
+) -> Bundle:
+    """The placed panoramas, and a point for the features that matches connect, of at most one in each panorama.
 
-    view: Int[Array, "observation"]
-    track: Int[Array, "observation"]
-    bearing: Float[Array, "observation 3"]
-
-
-def _make_tracks(features: Sequence[Features], relations: Mapping[IndexPair, RelativePose]) -> _Observations:
-    """Features that matches connect; tracks with two features of one panorama are dropped."""
+    Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
+    Relations of a panorama that few such points connect therefore state distances.
+    """
     starts = np.concatenate(((0,), np.cumsum([len(f) for f in features])))
     edges = np.concatenate([relation.indices + starts[[i, j]] for (i, j), relation in relations.items()])
     size = int(starts[-1])
     graph = scipy.sparse.coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(size, size))
     labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     nodes = np.unique(edges)
-    view = np.searchsorted(starts, nodes, side="right") - 1
-    track = np.unique(labels[nodes], return_inverse=True)[1].reshape(-1)
-    _, index, repeats = np.unique(np.stack((track, view)), axis=1, return_inverse=True, return_counts=True)
-    ambiguous = np.zeros(track.max() + 1, bool)
-    ambiguous[track[repeats[index.reshape(-1)] > 1]] = True
-    kept = ~ambiguous[track]
-    nodes, view, track = nodes[kept], view[kept], track[kept]
-    bearings = np.concatenate([f.bearings for f in features])[nodes]
-    return _Observations(view, track, bearings)
-
-
-class _GrowingGroup:
-    """Panoramas that are placed one after another; the first one is the world.
-
-    Attributes:
-        placed: panoramas in the order of placing; cameras of the bundle.
-        bundle: their poses, and the points that two or more of them see.
-    """
-
-    def __init__(
-        self,
-        observations: _Observations,
-        relations: Mapping[IndexPair, RelativePose],
-        downs: Float[Array, "view 3"],
-        noise: float,
-    ) -> None:
-        self._observations, self._relations, self._downs, self._noise = observations, relations, downs, noise
-        start = max(relations, key=lambda p: relations[p].score * min(1.0, relations[p].parallax / math.radians(5)))
-        self.placed = [start[0]]
-        self._triangulate([np.eye(3)], [np.zeros(3)])
-        self._add(start[1])
-
-    def grow(self) -> None:
-        """Place all panoramas."""
-        while True:
-            candidates: dict[int, float] = {}
-            for (i, j), relation in self._relations.items():
-                for inside, outside in ((i, j), (j, i)):
-                    if inside in self.placed and outside not in self.placed:
-                        candidates[outside] = candidates.get(outside, 0.0) + relation.score
-            if not candidates:
-                return
-            self._add(max(candidates, key=lambda v: candidates[v]))
-            self.bundle = adjust(self.bundle, self._noise, steps=6)
-
-    def with_distances(self) -> Bundle:
-        """The bundle with estimated distances for panoramas that few points connect to two others.
-
-        Matches of two panoramas determine the direction between them, and points that a third one sees the distance.
-        """
-        bundle, placed = self.bundle, self.placed
-        counts = np.bincount(bundle.point)
-        joint = np.bincount(bundle.camera[counts[bundle.point] > 2], minlength=len(placed))
-        weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
-        pairs = [pair for pair in self._relations if weak & set(pair)]
-        numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
-        return replace(bundle, pairs=numbers, distances=np.array([self._relations[pair].distance for pair in pairs]))
-
-    def _add(self, view: int) -> None:
-        """Place a panorama where its relations to placed ones do, the strongest of those that agree most."""
-        places = []
-        for other, rotation, origin in zip(self.placed, self.bundle.rotations, self.bundle.centres, strict=True):
-            motion = _motion_between(self._relations, view, other)
-            if motion is not None:
-                pair = (view, other) if (view, other) in self._relations else (other, view)
-                places.append((rotation @ motion[0], origin + rotation @ motion[1], self._relations[pair]))
-        support = [
-            sum(
-                other.score
-                for _, centre, other in places
-                if np.linalg.norm(centre - place[1]) < _AGREEING_PLACES * (place[2].distance + other.distance) / 2
-            )
-            for place in places
-        ]
-        rotation, centre, _ = places[int(np.argmax(support))]
-        self.placed.append(view)
-        self._triangulate([*self.bundle.rotations, rotation], [*self.bundle.centres, centre])
-
-    def _triangulate(self, rotations: Sequence[Array], centres: Sequence[Array]) -> None:
-        """Make the bundle of the placed panoramas at these poses."""
-        observations = self._observations
-        position = np.full(len(self._downs), -1)
-        position[self.placed] = np.arange(len(self.placed))
-        kept = position[observations.view] >= 0
-        counts = np.bincount(observations.track[kept], minlength=int(observations.track.max(initial=0)) + 1)
-        kept &= counts[observations.track] >= 2
-        tracks, point = np.unique(observations.track[kept], return_inverse=True)
-        point, camera, bearing = point.reshape(-1), position[observations.view[kept]], observations.bearing[kept]
-        rotation, centre = np.stack(rotations), np.stack(centres)
-        points = triangulate(rotation, centre, camera, point, bearing, len(tracks))
-        downs = self._downs[self.placed]
-        world = np.einsum("nij,nj->ni", rotation, downs)
-        known = np.isfinite(world).all(axis=1)
-        down = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
-        self.bundle = Bundle(rotation, centre, points, camera, point, bearing, downs, down / np.linalg.norm(down))
+    camera = np.searchsorted(placed, np.searchsorted(starts, nodes, side="right") - 1)
+    point = np.unique(labels[nodes], return_inverse=True)[1].reshape(-1)
+    _, index, repeats = np.unique(np.stack((point, camera)), axis=1, return_inverse=True, return_counts=True)
+    kept = ~np.isin(point, point[repeats[index.reshape(-1)] > 1])
+    camera, point = camera[kept], np.unique(point[kept], return_inverse=True)[1].reshape(-1)
+    bearing = np.concatenate([f.bearings for f in features])[nodes[kept]]
+    rotation, centre, down = poses[:, :3, :3], poses[:, :3, 3], downs[list(placed)]
+    counts = np.bincount(point)
+    points = triangulate(rotation, centre, camera, point, bearing, len(counts))
+    world = np.einsum("nij,nj->ni", rotation, down)
+    known = np.isfinite(world).all(axis=1)
+    mean = np.median(world[known], axis=0) if known.any() else np.array((0.0, 1, 0))
+    joint = np.bincount(camera[counts[point] > 2], minlength=len(placed))
+    weak = {view for view, number in zip(placed, joint, strict=True) if number < _FEW_JOINT}
+    pairs = [pair for pair in relations if weak & set(pair)]
+    numbers = np.array([[placed.index(view) for view in pair] for pair in pairs], np.int64).reshape(-1, 2)
+    distances = np.array([relations[pair].distance for pair in pairs])
+    mean /= np.linalg.norm(mean)
+    return Bundle(rotation, centre, points, camera, point, bearing, down, mean, numbers, distances)

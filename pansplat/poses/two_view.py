@@ -2,8 +2,9 @@
 
 Each match is evidence: the logarithm of the likelihood of its epipolar angle under a pose, over its likelihood by
 chance. The prior probability that a match is right follows from its ratio. The sum over all matches, the score, ranks
-the hypotheses of the minimal solvers, and measures whether the best one can be chance. Hypotheses come from five
-matches, and, because panoramas of tours are upright, from three and from two matches of levelled cameras.
+the hypotheses of the minimal solvers, and measures whether the best one can be chance. Hypotheses come from three
+matches of levelled cameras, from two with parallel walls, from five if gravity is unknown, and by estimated depth
+(`proposals`).
 
 Source: M. Fischler, R. Bolles, Random Sample Consensus, CACM 1981; O. Chum, J. Matas, O. Obdrzalek, Enhancing RANSAC
 by generalized model optimization, ACCV 2004; P. Torr, A. Zisserman, MLESAC, CVIU 2000.
@@ -24,7 +25,7 @@ from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import MatchDepths
 from pansplat.poses.features import Features, Matches
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
-from pansplat.poses.proposals import Pose, propose_by_depth
+from pansplat.poses.proposals import propose_by_depth
 from pansplat.poses.solvers import (
     Bearings,
     Rotation,
@@ -35,70 +36,55 @@ from pansplat.poses.solvers import (
     decompose_essential,
     epipolar_angles,
     essential_from_five,
+    make_motion,
     rotation_angle,
     rotation_exp,
     skew,
     two_view_depths,
     upright_from_three,
-    upright_from_two,
 )
 
-_WIDE_SHARE, _WIDE = 0.3, 3.0  # share of right matches of larger error, and how many times larger
-_MAX_ANGLE = 4.0  # largest residual of a right match, in the wide standard deviation
-_DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # of stitched panoramas: deviation and correlation length, radians
-_TAIL = 2.0  # degrees of freedom of the distribution of a match's own error
-_MAX_POLISHED, _MIN_POLISHED, _MIN_PROBABILITY = 1000, 8, 0.2  # matches of the polish; probability of each to be right
-_POLISH_SIZE = 7.0  # pixels; of a feature with 1.4 times the noise of a small one
+# Limits are chosen on the 78 pairs of zind, and numbers of samples on tours of generated homes (docs/poses.md).
+_WIDE_SHARE, _WIDE = 0.3, 3.0  # share of right matches with a larger error, and how many times larger it is
+_MAX_ANGLE = 4.0  # matches with a larger residual are wrong; in deviations of the larger error
+_DISTORTION, _DISTORTION_LENGTH = 1e-3, 0.15  # stitching: standard deviation and correlation length, radians
+_TAIL = 2.0  # degrees of freedom of Student's t, the distribution of a match's own error in the polish
+_MAX_POLISHED, _MIN_POLISHED = 1000, 8  # largest and smallest number of matches of the polish
+_MIN_PROBABILITY = 0.2  # matches that are less probably right have no part in the polish
+_POLISH_SIZE = 7.0  # pixels; a feature of this size has 1.4 times the noise of a small one
 _POLISH_WINDOW = 0.035  # largest residual, radians; what lies beyond the noise gives the density of wrong matches
-_POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # of the noise; steps with each
-_SHARE_STEPS = 4  # of expectation and maximisation, for the shares of right matches
-_POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of the groups of matches
-_POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # of right matches in the window, a priori
-_POLISH_WEIGHT = 4.0  # of these shares, in matches
+_POLISH_FACTORS, _POLISH_STEPS = (4, 2, 1), 4  # the noise is enlarged by each factor in turn, for so many steps
+_SHARE_STEPS = 4  # rounds of expectation and maximisation that find the shares of right matches
+_POLISH_PRIORS = np.array((0.667, 0.45, 0.15, 0.06, 0.02, 0.0125))  # limits of the prior between groups of matches
+_POLISH_SHARES = np.array((0.9, 0.8, 0.6, 0.4, 0.25, 0.12, 0.06))  # share of right matches in each group, a priori
+_POLISH_WEIGHT = 4.0  # the shares a priori count like so many matches
 _CALIBRATION = 1.5, 80.0  # formal standard deviations are multiplied by the larger of 1.5 and 80 / places
-_MIN_MATCHES, _MAX_MATCHES = 8, 2500
-_TOP_SETS = (40, 80, 160, 320, 640, 2500)  # best matches from which samples are drawn
-_SAMPLES = {5: 150, 3: 1200, 2: 600}  # of each set
+_MIN_MATCHES, _MAX_MATCHES = 8, 2500  # smallest and largest number of matches that a pose is sought from
+_TOP_SETS = (40, 80, 160, 320, 640, 2500)  # samples are drawn from so many best matches
+_SAMPLES = {5: 150, 3: 1200, 2: 600}  # number of samples from each set, by the matches in a sample
 _QUICK, _RESCORED = 500, 3000  # best matches that rank all hypotheses; hypotheses that all matches rank
 _LEVEL = [2, 0, 1]  # order of the axes in a levelled camera: x, y down, z
-_KEPT, _KEPT_PARALLEL = 10, 6  # hypotheses that are optimised: of all kinds, and of those with parallel walls
+_KEPT, _KEPT_PARALLEL = 10, 6  # hypotheses that are optimised: all kinds of samples, and those with parallel walls
 _PLACE = 0.2  # size of a cell that counts as one place, as a difference of unit vectors
-_MIN_PARALLAX = 5.0  # in the noise's standard deviation
-_MAX_UNCERTAINTY = math.radians(4)
-_FACTORS, _PARALLEL_FACTORS = (2, 1), (4, 2, 1)  # of the noise, in the optimisation of a hypothesis
-_DEPTH_FACTORS = (24, 6, 2, 1)  # of the noise, in their optimisation
-_EQUAL_SCORE = 0.9  # of neighbouring poses, because matches on one object share an error: parallel walls decide
-_SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # differences of equal hypotheses
-_SAME_ESSENTIAL, _COMPARED_ESSENTIALS = 0.998, 2000  # cosine of equal ones as vectors (3.6 degrees); best ones
+_MIN_PARALLAX = 5.0  # least parallax of two places, in standard deviations of the noise
+_MAX_UNCERTAINTY = math.radians(4)  # largest standard deviation of the direction
+# Hypotheses are optimised with the noise enlarged by each factor in turn: of samples, with parallel walls, by depth.
+_FACTORS, _PARALLEL_FACTORS, _DEPTH_FACTORS = (2, 1), (4, 2, 1), (24, 6, 2, 1)
+_SAME_ROTATION, _SAME_DIRECTION = math.radians(3), math.radians(10)  # equal hypotheses differ by less
+_SAME_ESSENTIAL = 0.998  # cosine of two essential matrices as vectors, above which they are equal (3.6 degrees)
+_COMPARED_ESSENTIALS = 2000  # best essential matrices among which different ones are sought
 # Matches that suffice without a comparison: repeated doors and windows give wrong poses up to 26 places.
 _NEEDED_PLACES, _NEEDED_SCORE, _NEEDED_MARGIN = 32, 80, 20
-
-
-@dataclass(frozen=True)
-class _Support:
-    """How much the matches support a pose; see `RelativePose`."""
-
-    places: float
-    score: float
-    margin: float
-
-    @property
-    def suffices(self) -> bool:
-        """Whether the matches alone support the pose."""
-        return self.places >= _NEEDED_PLACES and self.score >= _NEEDED_SCORE and self.margin >= _NEEDED_MARGIN
-
-
 _COMPARED = 16  # best hypotheses whose panoramas are compared
 # Logarithm of the odds of a hypothesis against none, linear in: 1, log(1 + score), log(1 + places), parallel walls,
 # log(0.003 + conflict), likeness, shade and hue with their weight, overlap, log(0.01 + slope of the translation),
-# whether it is that of a comparison (docs/poses.md).
+# whether it is that of a comparison. Fitted to 287 pairs (docs/poses.md).
 _ODDS = (-32.94, 0.73, 1.39, 3.95, -2.41, 7.65, -0.38, 4.57, -0.75, -1.73, -1.7)
-_LEAST_CONFLICT, _LEAST_SLOPE = 0.003, 0.01
-_NEAR = math.radians(4), 0.25, 0.15  # differences of one pose: rotation; translation, camera heights, and relative
-_PREFERENCE = 2.0  # logarithm of the odds by which a proposal must exceed a pose by matches
-_PROPOSAL_NOISE = math.radians(0.5), 0.1  # of the pose of a comparison: rotation; position, camera heights
-_LARGEST_SLOPE = 0.3
-_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0
+_LEAST_CONFLICT, _LEAST_SLOPE, _LARGEST_SLOPE = 0.003, 0.01, 0.3
+_NEAR = math.radians(4), 0.25, 0.15  # poses are one within: rotation; translation, camera heights, or relative
+_PREFERENCE = 2.0  # a pose by matches wins over a proposal whose log-odds are higher by less
+_PROPOSAL_NOISE = math.radians(0.5), 0.1  # standard deviations of a proposal: rotation; position, camera heights
+_CERTAIN_ODDS, _PROBABLE_ODDS, _DOUBTFUL_ODDS = 2.0, 1.0, -2.0  # least log-odds of each
 _SHOWN_ODDS = 0.0  # above which messages state the probability; a pose that is rather wrong than right has none
 
 
@@ -108,8 +94,8 @@ class Hypothesis:
 
     Attributes:
         score: natural logarithm of the likelihood ratio against chance.
-        probability: of each match to be right.
-        distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
+        probability: probability of each match to be right.
+        distance: camera heights between the cameras, by the estimated depths; NaN if they do not state it.
         is_proposed: whether it is the pose of a comparison of both panoramas, not optimised over matches.
     """
 
@@ -119,6 +105,11 @@ class Hypothesis:
     probability: Float[Array, "match"]
     distance: float = math.nan
     is_proposed: bool = False
+
+    @property
+    def motion(self) -> Float[Array, "4 4"]:
+        """From the first camera's frame to the second one's, camera heights."""
+        return make_motion(self.rotation, self.distance * self.translation)
 
 
 def _match_noise(first: Features, second: Features, indices: Int[Array, "match 2"]) -> Float[Array, "match"]:
@@ -144,7 +135,7 @@ class _Evidence:
         axes: gravity and walls of both panoramas.
         depths: estimated at the matches, if they are known.
         surroundings: all that both panoramas show, with estimated depths.
-        links: from each panorama towards the other one, as a tour's links state them.
+        links: directions of each panorama towards the other one, as a tour's links state them.
     """
 
     a: Float[Array, "match 3"]
@@ -155,14 +146,6 @@ class _Evidence:
     depths: MatchDepths | None = None
     surroundings: tuple[Surroundings, Surroundings] | None = None
     links: LinkDirections = NO_LINKS
-
-    def strongest(self, count: int) -> _Evidence:
-        """The evidence of the first `count` matches."""
-        first = slice(count)
-        depths = None if self.depths is None else self.depths.select(first)
-        return replace(
-            self, a=self.a[first], b=self.b[first], prior=self.prior[first], noise=self.noise[first], depths=depths
-        )
 
     def with_noise(self, factor: float) -> _Evidence:
         """The evidence with another noise, in units of this one."""
@@ -204,10 +187,8 @@ class _Evidence:
             if not np.abs(step).max() < 0.5:
                 break
             found = self.evaluate(rotation, translation)
-            improved = found.score > best.score + 1e-3
-            if found.score > best.score:
-                best = found
-            if not improved:
+            before, best = best.score, max(best, found, key=lambda hypothesis: hypothesis.score)
+            if best.score <= before + 1e-3:
                 break
         return best
 
@@ -254,8 +235,8 @@ class _Linearised:
     """Epipolar angles of matches, radians, with their derivatives.
 
     Attributes:
-        by_pose: by the rotation vector (3) and the direction (2) of the pose.
-        by_first, by_second: by the bearings of the first and of the second panorama.
+        by_pose: derivatives by the rotation vector (3) and the direction (2) of the pose.
+        by_first, by_second: derivatives by the bearings of the first and of the second panorama.
     """
 
     angle: Float[Array, "n"]
@@ -351,57 +332,55 @@ def _search_hypotheses(evidence: _Evidence, rng: np.random.Generator) -> tuple[l
     """Distinct hypotheses that are optimised over the matches, best first, and those of a comparison as proposed."""
     if len(evidence.a) < _MIN_MATCHES:
         return [], []
-    free, parallel = _sample_essentials(evidence, rng)
-    found = [_optimise(essential, evidence, _FACTORS) for essential in _choose_best(free, evidence, _KEPT)]
-    agreed, alike = _propose_by_depth(evidence, rng)
-    directions = [(rotation, t / max(float(np.linalg.norm(t)), 1e-9)) for rotation, t in (*agreed, *alike)]
-    found += [_optimise(skew(unit) @ rotation, evidence, _DEPTH_FACTORS) for rotation, unit in directions]
-    if len(parallel):  # inexact: compared among themselves, with a larger tolerance
-        chosen = _choose_best(parallel, evidence.with_noise(2), _KEPT_PARALLEL)
+    chosen = _choose_best(_sample_essentials(evidence, rng), evidence, _KEPT)
+    found = [_optimise(essential, evidence, _FACTORS) for essential in chosen]
+    if evidence.axes.has_walls:  # inexact: compared among themselves, with a larger tolerance
+        chosen = _choose_best(_sample_parallel(evidence, rng), evidence.with_noise(2), _KEPT_PARALLEL)
         found += [_optimise(essential, evidence, _PARALLEL_FACTORS) for essential in chosen]
-    proposed = [
-        evidence.evaluate(rotation, unit, float(np.linalg.norm(t)))
-        for (rotation, t), (_, unit) in zip(alike, directions[len(agreed) :], strict=True)
-    ]
-    return _merge_same(found, evidence.axes), proposed
+    proposed = []
+    if evidence.depths is not None and evidence.surroundings is not None:
+        matches = evidence.a, evidence.b, evidence.prior, evidence.depths
+        for rotation, translation in propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.links):
+            distance = float(np.linalg.norm(translation))
+            unit = translation / max(distance, 1e-9)
+            found.append(_optimise(skew(unit) @ rotation, evidence, _DEPTH_FACTORS))
+            proposed.append(evidence.evaluate(rotation, unit, distance))
+    return _merge_same(found), proposed
 
 
-def _sample_essentials(
-    evidence: _Evidence, rng: np.random.Generator
-) -> tuple[Float[Array, "n 3 3"], Float[Array, "m 3 3"]]:
-    """Essential matrices of random samples: of any pose or of levelled cameras, and of cameras with parallel walls."""
+def _sample_essentials(evidence: _Evidence, rng: np.random.Generator) -> Float[Array, "n 3 3"]:
+    """Essential matrices of random samples of levelled cameras, and of cameras in any pose if gravity is unknown."""
     a, b, axes = evidence.a, evidence.b, evidence.axes
     levels = axes.first.axes[_LEVEL], axes.second.axes[_LEVEL]
-    free, parallel = [], [np.empty((0, 3, 3))]
+    found = []
     for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
-        chosen = _draw(rng, top, _SAMPLES[5], 5)
-        free.append(essential_from_five(a[chosen], b[chosen])[0])
-        for size, solver in ((3, upright_from_three), (2, upright_from_two)):
-            chosen = _draw(rng, top, _SAMPLES[size], size)
-            rotations, translations = solver(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
-            free.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
-        for rotation in axes.wall_rotations:
+        chosen = _draw(rng, top, _SAMPLES[3], 3)
+        rotations, translations = upright_from_three(a[chosen] @ levels[0].T, b[chosen] @ levels[1].T)
+        found.append(levels[1].T @ skew(translations) @ rotations @ levels[0])
+        if not axes.has_down:
+            chosen = _draw(rng, top, _SAMPLES[5], 5)
+            found.append(essential_from_five(a[chosen], b[chosen])[0])
+    return np.concatenate(found)
+
+
+def _sample_parallel(evidence: _Evidence, rng: np.random.Generator) -> Float[Array, "n 3 3"]:
+    """Essential matrices of random samples of cameras with parallel walls."""
+    a, b, found = evidence.a, evidence.b, []
+    for top in sorted({min(top, len(a)) for top in _TOP_SETS}):
+        for rotation in evidence.axes.wall_rotations:
             chosen = _draw(rng, top, _SAMPLES[2], 2)
             normals = cross(a[chosen] @ rotation.T, b[chosen])
             translations = cross(normals[:, 0], normals[:, 1])
             translations /= np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-12)
-            parallel.append(skew(translations) @ rotation)
-    return np.concatenate(free), np.concatenate(parallel)
+            found.append(skew(translations) @ rotation)
+    return np.concatenate(found)
 
 
 def _choose_best(essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int) -> Float[Array, "kept 3 3"]:
     """At most `count` different essential matrices with the highest scores, best first."""
-    quick = _score_essentials(essential, evidence.strongest(_QUICK))
+    quick = _score_essentials(essential, evidence, _QUICK)
     essential = essential[np.argsort(-quick, kind="stable")[:_RESCORED]]
     return essential[_pick_distinct(essential, _score_essentials(essential, evidence), count)]
-
-
-def _propose_by_depth(evidence: _Evidence, rng: np.random.Generator) -> tuple[list[Pose], list[Pose]]:
-    """Poses by the estimated depths: of many matches, and of a comparison; none without depths."""
-    if evidence.depths is None or evidence.surroundings is None:
-        return [], []
-    matches = evidence.a, evidence.b, evidence.prior, evidence.depths
-    return propose_by_depth(*matches, evidence.axes, evidence.surroundings, evidence.links, rng)
 
 
 def _sample_depths(
@@ -426,23 +405,13 @@ def _optimise(essential: Float[Array, "3 3"], evidence: _Evidence, factors: Sequ
     return best
 
 
-def _merge_same(found: Sequence[Hypothesis], axes: RotationPrior) -> list[Hypothesis]:
-    """One hypothesis of each group of equal ones, best first.
-
-    It is the one of the highest score, or one of nearly this score that makes the walls parallel.
-    """
+def _merge_same(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The hypothesis of the highest score of each group of equal ones, best first."""
     distinct: list[Hypothesis] = []
     for hypothesis in sorted(found, key=lambda h: -h.score):
-        same = next((n for n, other in enumerate(distinct) if _are_same(hypothesis, other)), None)
-        if same is None:
+        if not any(_are_same(hypothesis, other) for other in distinct):
             distinct.append(hypothesis)
-        elif (
-            hypothesis.score > _EQUAL_SCORE * distinct[same].score
-            and axes.confirms(hypothesis.rotation)
-            and not axes.confirms(distinct[same].rotation)
-        ):
-            distinct[same] = hypothesis
-    return sorted(distinct, key=lambda h: -h.score)
+    return distinct
 
 
 def _are_same(first: Hypothesis, second: Hypothesis) -> bool:
@@ -457,12 +426,15 @@ def _draw(rng: np.random.Generator, top: int, samples: int, size: int) -> Int[Ar
     return chosen + np.arange(size)
 
 
-def _score_essentials(essential: Float[Array, "n 3 3"], evidence: _Evidence) -> Float[Array, "n"]:
-    """Scores of essential matrices without the signs of the depths."""
-    a, b = (np.ascontiguousarray(rays.T, np.float32) for rays in (evidence.a, evidence.b))
-    gain = math.sqrt(2 / math.pi) * evidence.prior / (1 - evidence.prior) / evidence.noise
-    scores = _sum_gains(essential.astype(np.float32), a, b, evidence.noise.astype(np.float32), gain)
-    return scores + float(np.log1p(-evidence.prior).sum())
+def _score_essentials(
+    essential: Float[Array, "n 3 3"], evidence: _Evidence, count: int | None = None
+) -> Float[Array, "n"]:
+    """Scores of essential matrices without the signs of the depths, by the first `count` matches."""
+    a, b = (np.ascontiguousarray(rays[:count].T, np.float32) for rays in (evidence.a, evidence.b))
+    prior, noise = evidence.prior[:count], evidence.noise[:count]
+    gain = math.sqrt(2 / math.pi) * prior / (1 - prior) / noise
+    scores = _sum_gains(essential.astype(np.float32), a, b, noise.astype(np.float32), gain)
+    return scores + float(np.log1p(-prior).sum())
 
 
 @compiled
@@ -514,12 +486,11 @@ class Hypotheses:
     """Relative poses of two panoramas, of which at most one is right: a row for each compared `Hypothesis`.
 
     Attributes:
-        rotations, translations: x2 = R x1 + t, camera heights.
+        motions: motions from the first camera's frame to the second one's, camera heights.
         log_odds: logarithm of the odds of each against none.
     """
 
-    rotations: Float[Array, "n 3 3"] = field(default_factory=lambda: np.empty((0, 3, 3)))
-    translations: Float[Array, "n 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    motions: Float[Array, "n 4 4"] = field(default_factory=lambda: np.empty((0, 4, 4)))
     log_odds: Float[Array, "n"] = field(default_factory=lambda: np.empty(0))
 
 
@@ -531,12 +502,11 @@ class RelativePose:
         rotation, translation: x2 = R x1 + t; |t| = 1.
         indices: features of the matches that agree with it; none if it is that of a comparison.
         score: natural logarithm of the likelihood ratio against chance.
-        margin: how much the score exceeds that of the best different pose.
         places: number of different places (12 degrees) with right matches, in the panorama that has fewer.
         parallax: 90 % quantile of the parallax of these matches, radians.
         uncertainty: standard deviations of rotation and direction by the noise of the matches, the distortion of the
             panoramas and the number of places, radians.
-        distance: of the cameras in camera heights, by the estimated depths; NaN if they do not state it.
+        distance: camera heights between the cameras, by the estimated depths; NaN if they do not state it.
         log_odds: logarithm of the odds that the pose is right, by matches and comparison; infinite if matches suffice.
         problem: why the pose must not be used; None if it passes the check.
         hypotheses: all that were compared, this pose among them.
@@ -546,7 +516,6 @@ class RelativePose:
     translation: Vector
     indices: Int[Array, "match 2"]
     score: float = 0.0
-    margin: float = 0.0
     places: float = 0.0
     parallax: float = 0.0
     uncertainty: tuple[float, float] = (math.inf, math.inf)
@@ -554,6 +523,11 @@ class RelativePose:
     log_odds: float = -math.inf
     problem: str | None = None
     hypotheses: Hypotheses = Hypotheses()
+
+    @property
+    def motion(self) -> Float[Array, "4 4"]:
+        """From the first camera's frame to the second one's, camera heights."""
+        return make_motion(self.rotation, self.distance * self.translation)
 
     @property
     def is_matched(self) -> bool:
@@ -590,11 +564,11 @@ def estimate_relative_pose(
 
     Args:
         first, second: features of both panoramas.
-        matches: between them.
+        matches: matches of these features.
         axes: gravity and walls of both panoramas.
         surroundings: all that both panoramas show, with estimated depths; without them only the matches count.
-        links: from each panorama towards the other one.
-        seed: of the random samples.
+        links: directions of each panorama towards the other one.
+        seed: seed of the random samples.
     """
     count = min(len(matches), _MAX_MATCHES)
     indices = matches.indices[:count]
@@ -609,63 +583,43 @@ def estimate_relative_pose(
     odds = np.array([_log_odds(h, evidence) for h in compared])
     best, log_odds = _choose_compared(compared, odds)
     # Matches that suffice decide alone: the odds also use estimated depths, which are wrong for a camera on stairs.
-    if _find_support(found[0], found, evidence).suffices:
-        best = found[0]
-    hypotheses = Hypotheses(
-        np.stack([h.rotation for h in compared]), np.stack([h.distance * h.translation for h in compared]), odds
+    if _suffice(found, evidence):
+        best, log_odds = found[0], math.inf
+    places = _count_all_places(best, evidence)
+    relation = RelativePose(
+        best.rotation,
+        best.translation,
+        indices[:0],
+        score=best.score,
+        places=places,
+        uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)),
+        distance=best.distance,
+        log_odds=log_odds,
+        problem=None if log_odds >= _PROBABLE_ODDS else _describe_doubt(places, log_odds),
+        hypotheses=Hypotheses(np.stack([h.motion for h in compared]), odds),
     )
     if best.is_proposed:
-        return _as_proposed(best, log_odds, hypotheses, evidence)
-    support = _find_support(best, found, evidence)
+        return relation
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
+    relation = replace(relation, indices=indices[right], parallax=spread, uncertainty=(math.inf, math.inf))
+    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
+        problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
+        return replace(relation, problem=problem, hypotheses=Hypotheses())
+    if log_odds < _DOUBTFUL_ODDS:
+        return relation
     used = np.flatnonzero(right)[:_MAX_POLISHED]
     rotation, translation, deviations = polish_pose(
         a[used], b[used], best.rotation, best.translation, evidence.noise[used], axes
     )
-    uncertainty = _calibrate(deviations, support.places)
-    problem = _find_problem(support, log_odds)
-    if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
-        problem, hypotheses = (
-            f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees",
-            Hypotheses(),
-        )
-    elif problem is None and surroundings is not None and not math.isfinite(best.distance):
-        problem = "the distance of the cameras cannot be determined"
-    elif problem is None and uncertainty[1] > _MAX_UNCERTAINTY:
-        problem = f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees"
-    return RelativePose(
-        rotation,
-        translation,
-        indices[right],
-        score=best.score,
-        margin=support.margin,
-        places=support.places,
-        parallax=spread,
-        uncertainty=uncertainty,
-        distance=best.distance,
-        log_odds=math.inf if support.suffices else log_odds,
-        problem=problem,
-        hypotheses=hypotheses,
-    )
-
-
-def _as_proposed(best: Hypothesis, log_odds: float, hypotheses: Hypotheses, evidence: _Evidence) -> RelativePose:
-    """The relative pose of a comparison, which has no matches."""
-    support = _Support(_count_all_places(best, evidence), best.score, 0.0)
-    return RelativePose(
-        best.rotation,
-        best.translation,
-        np.empty((0, 2), np.int64),
-        score=best.score,
-        places=support.places,
-        uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)),
-        distance=best.distance,
-        log_odds=log_odds,
-        problem=_find_problem(support, log_odds),
-        hypotheses=hypotheses,
-    )
+    uncertainty = _calibrate(deviations, places)
+    relation = replace(relation, rotation=rotation, translation=translation, uncertainty=uncertainty)
+    if relation.is_reliable and surroundings is not None and not math.isfinite(best.distance):
+        return replace(relation, problem="the distance of the cameras cannot be determined")
+    if relation.is_reliable and uncertainty[1] > _MAX_UNCERTAINTY:
+        return replace(relation, problem=f"the direction is uncertain by {math.degrees(uncertainty[1]):.0f} degrees")
+    return relation
 
 
 def _choose_compared(compared: Sequence[Hypothesis], odds: Float[Array, "n"]) -> tuple[Hypothesis, float]:
@@ -680,8 +634,7 @@ def _choose_compared(compared: Sequence[Hypothesis], odds: Float[Array, "n"]) ->
 
 def _are_near(first: Hypothesis, second: Hypothesis) -> bool:
     """Whether two hypotheses state one pose, by the distance of the cameras, too."""
-    translations = [h.distance * h.translation for h in (first, second)]
-    gap = float(np.linalg.norm(translations[0] - translations[1]))
+    gap = float(np.linalg.norm(first.motion[:3, 3] - second.motion[:3, 3]))
     longest = max(first.distance, second.distance)
     turned = rotation_angle(first.rotation @ second.rotation.T)
     return first is second or bool(turned < _NEAR[0] and gap < max(_NEAR[1], _NEAR[2] * longest))
@@ -691,7 +644,7 @@ def _log_odds(hypothesis: Hypothesis, evidence: _Evidence) -> float:
     """Logarithm of the odds of a hypothesis against none; -inf if the panoramas cannot be compared."""
     if evidence.surroundings is None or not math.isfinite(hypothesis.distance):
         return -math.inf
-    translation = hypothesis.distance * hypothesis.translation
+    translation = hypothesis.motion[:3, 3]
     comparison = compare(*evidence.surroundings, hypothesis.rotation, translation)
     slope = abs(float(hypothesis.translation @ (hypothesis.rotation @ evidence.axes.first.axes[0])))
     values = (
@@ -714,23 +667,22 @@ def _count_all_places(hypothesis: Hypothesis, evidence: _Evidence) -> float:
     return min(_count_places(rays, hypothesis.probability) for rays in (evidence.a, evidence.b))
 
 
-def _find_support(best: Hypothesis, found: Sequence[Hypothesis], evidence: _Evidence) -> _Support:
-    """How much the matches support one of the hypotheses."""
-    margin = best.score - max((h.score for h in found if h is not best), default=0.0)
-    return _Support(_count_all_places(best, evidence), best.score, margin)
+def _suffice(found: Sequence[Hypothesis], evidence: _Evidence) -> bool:
+    """Whether the matches alone support the first hypothesis, which has the highest score."""
+    best, margin = found[0], found[0].score - (found[1].score if len(found) > 1 else 0.0)
+    is_clear = best.score >= _NEEDED_SCORE and margin >= _NEEDED_MARGIN
+    return is_clear and _count_all_places(best, evidence) >= _NEEDED_PLACES
 
 
-def _find_problem(support: _Support, log_odds: float) -> str | None:
-    """Why a pose must not be used; None if its matches suffice, or with the comparison of both panoramas."""
-    if support.suffices or log_odds >= _PROBABLE_ODDS:
-        return None
+def _describe_doubt(places: float, log_odds: float) -> str:
+    """Why a pose must not be used whose matches do not suffice, also with the comparison of both panoramas."""
     outcome = "too uncertain to use"
     if log_odds > _SHOWN_ODDS:
         probability, needed = (100 / (1 + math.exp(-odds)) for odds in (log_odds, _PROBABLE_ODDS))
         outcome = f"right with a probability of {probability:.0f} %, and {needed:.0f} % are needed"
     return (
-        f"too little in common: {support.places:.0f} places match where {_NEEDED_PLACES:g} suffice, and the best pose "
-        f"is {outcome}"
+        f"too little in common: {places:.0f} places match where {_NEEDED_PLACES:g} suffice, and the best pose is "
+        f"{outcome}"
     )
 
 

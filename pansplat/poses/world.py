@@ -21,21 +21,22 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.system.threads import worker_threads
 from pansplat.tours.floor import find_storeys
 
-FLOOR_HEIGHT = 256  # pixels of the panoramas in which the floor is searched
-_STEPS = 0.03  # relative difference of neighbouring candidates
-_RANGE = 0.12, 12.0  # of the camera's height in units of the distance of two cameras
-_STEEPEST, _FLATTEST = math.radians(85), math.radians(12)  # below the horizon
-_WINDOW = 9  # pixels over which images are compared
-_MIN_DEVIATION = 0.012  # of grey values in a window with texture
+FLOOR_HEIGHT = 256  # rows of the panoramas in which the floor is searched
+_STEPS = 0.03  # relative difference of neighbouring heights
+_RANGE = 0.12, 12.0  # heights of the camera that are searched, over the distance of two cameras
+_STEEPEST, _FLATTEST = math.radians(85), math.radians(12)  # rays that are used are between, below the horizon
+_WINDOW = 9  # pixels; side of the windows that are compared
+_MIN_DEVIATION = 0.012  # least deviation of grey values in a window, which are 0 to 1
 _MIN_CORRELATION = 0.6
-_MIN_EVIDENCE, _MIN_CONTRAST = 0.02, 1.25  # mean correlation of the floor; ratio to the best other height
-_LOWER_SHARE, _LOWER_CONTRAST = 0.5, 2.0  # of a lower plane that is the floor: evidence, and contrast to its ring
-_DOUBTFUL_SHARE, _DOUBTFUL_CONTRAST = 0.25, 1.45  # of a lower plane that may be the floor
-_RING = 0.12, 0.36  # relative heights with which a plane is compared
-_LOWER = 1.2, 2.6  # height of the cameras over a lower plane, in that over the best one
+_MIN_EVIDENCE, _MIN_CONTRAST = 0.02, 1.25  # mean correlation that a floor needs; its ratio to any other height
+# A plane below the best one is the floor, or may be it: its share of the evidence, and contrast to its ring.
+_LOWER_SHARE, _LOWER_CONTRAST = 0.5, 2.0
+_DOUBTFUL_SHARE, _DOUBTFUL_CONTRAST = 0.25, 1.45
+_RING = 0.12, 0.36  # a plane is compared with those whose height differs by so much, relative
+_LOWER = 1.2, 2.6  # lower planes are so much deeper than the best one
 _SAME_HEIGHT = 0.1  # largest logarithm of the ratio of the heights over the floors of two storeys
-_FLOOR_PAIRS = 8  # nearest pairs of a storey that are compared
-_NEAR_QUANTILE, _FAR_QUANTILE = 0.02, 0.98  # of the distances of the points
+_FLOOR_PAIRS = 8  # the floor of a storey is found by so many nearest pairs
+_NEAR_QUANTILE, _FAR_QUANTILE = 0.02, 0.98  # quantiles of the points' distances that give near and far
 _NEAR_FACTOR, _FAR_FACTOR = 0.7, 1.4
 
 
@@ -138,7 +139,7 @@ def find_floor(
     Args:
         images: grey panoramas in [0, 1], of `FLOOR_HEIGHT`.
         poses: levelled, y down.
-        pairs: of panoramas that are compared.
+        pairs: panoramas that are compared.
     """
     reference = float(np.median([np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3]) for i, j in pairs]))
     low, high = (math.log(reference * bound) for bound in _RANGE)
@@ -206,7 +207,7 @@ def _floor_evidence(
     seen &= deviation > _MIN_DEVIATION
     area = np.sqrt(np.maximum(1 - down**2, 0)) * seen
     padded = cv2.copyMakeBorder(other.astype(np.float32), 0, 0, 2, 2, cv2.BORDER_WRAP)
-    toward_floor = rays / np.maximum(down, 1e-3)[..., None] @ other_pose[:3, :3]  # of one unit of height
+    toward_floor = rays / np.maximum(down, 1e-3)[..., None] @ other_pose[:3, :3]  # for a floor one unit below
     x, y, z = np.moveaxis(toward_floor.astype(np.float32), -1, 0)
     offset = ((pose[:3, 3] - other_pose[:3, 3]) @ other_pose[:3, :3]).astype(np.float32)
     turn = np.float32(rows / math.pi)

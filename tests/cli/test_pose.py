@@ -238,7 +238,7 @@ def test_messages_name_rooms_by_their_titles(linked: Path, estimator, capsys) ->
 def test_figures_of_reasons_are_for_verbose(folder: Path, estimator, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     relation = RelativePose(np.eye(3), np.eye(3)[2], np.empty((0, 2), int), problem="too little in common: 20 places")
-    estimator(lambda images, **options: replace(_place_two(images), relations={(0, 1): relation}))
+    estimator(lambda images, **options: replace(_place_two(images), relations={tuple(images[:2]): relation}))
     for options in ([], ["--verbose"]):
         assert run(["pose", str(folder), *options]) == 0
         printed = capsys.readouterr().out

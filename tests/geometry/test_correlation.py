@@ -85,15 +85,21 @@ def _inputs(channels=5, candidates=7, height=H):
     )
 
 
+@pytest.fixture(params=["warps", "kernels"])
+def backend(request, monkeypatch):
+    """Both ways to correlate."""
+    monkeypatch.setattr(correlation, "_uses_kernels", lambda features: request.param == "kernels")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["torch", "kernel"])
+@pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_correlation_is_the_product_with_the_warped_panorama(sampling, backend):
+def test_correlation_is_the_product_with_the_warped_panorama(sampling):
     reference, other, inverse_depth, poses = _inputs()
     reference.requires_grad_()
     other.requires_grad_()
     truth = _truth(reference, other, inverse_depth, poses, sampling)
-    result = correlate(reference, other, inverse_depth, poses, sampling, backend)
+    result = correlate(reference, other, inverse_depth, poses, sampling)
     assert torch.allclose(result, truth, atol=1e-12)
     upstream = torch.randn_like(truth)
     expected = torch.autograd.grad(truth, (reference, other), upstream)
@@ -101,25 +107,25 @@ def test_correlation_is_the_product_with_the_warped_panorama(sampling, backend):
         assert torch.allclose(gradient, right, atol=1e-12)
 
 
-@pytest.mark.parametrize("backend", ["torch", "kernel"])
+@pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_float32_correlation_is_within_1e_4_of_float64(sampling, backend):
+def test_float32_correlation_is_within_1e_4_of_float64(sampling):
     inputs = _inputs(channels=64, candidates=16, height=32)
-    truth = correlate(*inputs, sampling, "torch")
-    single = correlate(*(tensor.float() for tensor in inputs), sampling, backend)
+    truth = _truth(*inputs, sampling)
+    single = correlate(*(tensor.float() for tensor in inputs), sampling)
     # Rounding can move a sample across the map's border, where zeros begin.
     error = (single - truth).abs().flatten().sort().values
     assert error[int(0.999 * len(error))] < 1e-4 * truth.std()
     assert sampling == "corners" or error[-1] < 3e-4 * truth.std()
 
 
-@pytest.mark.parametrize("backend", ["torch", "kernel"])
-def test_chunks_do_not_change_the_correlation(backend, monkeypatch):
+@pytest.mark.usefixtures("backend")
+def test_chunks_do_not_change_the_correlation(monkeypatch):
     reference, other, inverse_depth, poses = _inputs()
 
     def run():
         a, b = reference.clone().requires_grad_(), other.clone().requires_grad_()
-        result = correlate(a, b, inverse_depth, poses, "sphere", backend)
+        result = correlate(a, b, inverse_depth, poses, "sphere")
         return (result, *torch.autograd.grad(result.square().sum(), (a, b)))
 
     whole = run()
@@ -158,5 +164,5 @@ def test_half_precision_features_are_multiplied_in_float32(dtype):
 def test_a_pose_with_nan_gives_nan(sampling):
     reference, other, inverse_depth, poses = _inputs()
     poses[1, 0, 3] = math.nan
-    result = correlate(reference, other, inverse_depth, poses, sampling, "kernel")
+    result = correlate(reference, other, inverse_depth, poses, sampling)
     assert torch.isfinite(result[0]).all() and result[1].isnan().all()

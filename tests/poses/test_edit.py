@@ -82,20 +82,6 @@ def test_states_and_reasons_are_those_of_the_estimate_also_from_its_cache_and_fr
     assert _load(folder)["f"].placement.reason == "no door"
 
 
-def test_rejections_and_suggestions_of_earlier_versions_are_ignored_and_kept(folder: Path):
-    def change(content: dict) -> None:
-        pose = content["poses"].pop("e.png")
-        content["rejected"] = [{"poses": {"e.png": pose}, "pairs": [{"between": ["d.png", "e.png"]}], "world": 1}]
-        content["estimate"]["suggestions"] = [{"between": ["a.png", "f.png"], "places": [[1.0, 2.0, 0.5, -1.5]]}]
-
-    content = _write_edited(folder, change)
-    view = _load(folder)["e"]
-    assert (view.placement.state, view.placement.reason) == ("not placed", "poses.json has no pose of it")
-    _edit(folder).place({folder / "e.png": np.eye(4)}, 0)
-    assert _states(folder) == ALL | {"e": "by hand"}
-    assert _content(folder)["rejected"] == content["rejected"]
-
-
 def test_a_pose_placed_by_hand_is_in_the_world_of_the_others_and_undone_in_steps(folder: Path):
     editor, pose = _edit(folder), np.eye(4)
     pose[:3, 3] = 0.5, 0, 2
@@ -292,13 +278,6 @@ def test_what_a_user_adds_to_estimated_poses_stays_and_the_poses_are_estimated_a
     assert (folder / "poses.json.bak").read_bytes() == before
     pair = pansplat.load_sets(folder)[0]
     assert (pair.near, pair.far) == (0.2, 5)
-
-
-def test_a_range_that_was_estimated_is_estimated_anew(folder: Path):
-    images = sorted(folder.glob("*.png"))
-    for factor in (1, 2):
-        write_poses(_scaled(factor, images), folder / "poses.json")
-        assert [(pair.near, pair.far) for pair in pansplat.load_sets(folder)][:1] == [(0.4 * factor, 8 * factor)]
 
 
 def test_near_and_far_of_a_world_that_a_user_states_stay(folder: Path):

@@ -132,7 +132,7 @@ def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, 
 
 
 def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
-    figures = {"score": 90.0, "margin": 50.0, "places": 40.0, "uncertainty": (0.01, 0.01), "distance": 1.0}
+    figures = {"score": 90.0, "places": 40.0, "uncertainty": (0.01, 0.01), "distance": 1.0}
     none = np.empty((0, 2), int)
     return RelativePose(np.eye(3), np.eye(3)[0], none, log_odds=log_odds, problem=problem, **figures)
 
@@ -170,7 +170,7 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     descriptors = rng.uniform(size=(400, 128)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     every = Features(bearings, descriptors, np.ones(400), np.full(400, 1e-3))
-    learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3), 0.01)
+    learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3))
     found = Matches(np.array(((2, 1), (0, 2))), np.array((0.99, 0.4)))
     monkeypatch.setattr("pansplat.poses.estimate.match_learned", lambda matcher, first, second: found)
     few, many = (_view(every.strongest(count), np.zeros((64, 128), np.float32), learned) for count in (20, 400))
@@ -184,7 +184,7 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
 
 def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatch: pytest.MonkeyPatch) -> None:
     """Panoramas 0 to 7 are one home and 8 to 10 another one, in which no pair is certain."""
-    views = [replace(_view(_no_features(1), np.zeros((4, 8), np.float32)), picture_hash=str(n)) for n in range(11)]
+    views = [replace(_view(_no_features(1), np.zeros((4, 8), np.float32)), key=str(n)) for n in range(11)]
     numbers = {id(view.features): n for n, view in enumerate(views)}
 
     def quick(first: Features, second: Features) -> float:
@@ -192,7 +192,7 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
         return 10.0 + (i > 7) if j > 7 or (i, j) == (0, 7) else 100.0 - i - j
 
     def relate(first: _View, second: _View, *_: object) -> RelativePose:
-        return _relation(math.inf) if int(second.picture_hash) < 8 else _relation(0.0, "nothing in common")
+        return _relation(math.inf) if int(second.key) < 8 else _relation(0.0, "nothing in common")
 
     monkeypatch.setattr("pansplat.poses.estimate._quick_overlap", quick)
     monkeypatch.setattr("pansplat.poses.estimate._estimate_pair", relate)

@@ -13,7 +13,6 @@ from pansplat.poses.solvers import (
     skew,
     two_view_depths,
     upright_from_three,
-    upright_from_two,
 )
 
 
@@ -42,13 +41,12 @@ def test_singular_samples_of_five_bearings_give_no_invalid_number() -> None:
     assert np.isfinite(found).all()
 
 
-@pytest.mark.parametrize(("size", "solver"), [(3, upright_from_three), (2, upright_from_two)])
-def test_few_bearings_give_the_pose_of_upright_cameras_in_most_samples(scene, size, solver) -> None:
+def test_three_bearings_give_the_pose_of_upright_cameras_in_most_samples(scene) -> None:
     for seed in range(5):
-        translation = np.array((np.cos(seed), 0.0 if size == 2 else 0.4, np.sin(seed)))
-        bearings = scene(seed, 20 * size, upright=True, translation=translation / np.linalg.norm(translation))
-        a, b = (x.reshape(20, size, 3) for x in (bearings.first, bearings.second))
-        rotations, translations = solver(a, b)
+        translation = np.array((np.cos(seed), 0.4, np.sin(seed)))
+        bearings = scene(seed, 60, upright=True, translation=translation / np.linalg.norm(translation))
+        a, b = (x.reshape(20, 3, 3) for x in (bearings.first, bearings.second))
+        rotations, translations = upright_from_three(a, b)
         errors = rotation_angle(rotations @ bearings.rotation.T) + np.minimum(
             angle_between(translations, bearings.translation), angle_between(-translations, bearings.translation)
         )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pansplat.poses.features import Features
-from pansplat.poses.solvers import rotation_angle, rotation_exp
+from pansplat.poses.solvers import make_motion, rotation_angle, rotation_exp
 from pansplat.poses.tour import Group, IndexPair, Tour, build_tour
 from pansplat.poses.two_view import Hypotheses, RelativePose
 
@@ -26,7 +26,6 @@ def relate(pair: IndexPair, indices: np.ndarray) -> RelativePose:
         way / distance,
         indices,
         score=300.0,
-        margin=99.0,
         places=50.0,
         uncertainty=(1e-3, 1e-3),
         distance=distance,
@@ -155,7 +154,7 @@ def suggest(pair: IndexPair, *log_odds: float, turn: float = 0.0, problem: str |
     wrong = [rotation_exp(np.array((0, 1.0 + n + 0.5 * pair[0], 0))) @ right.rotation for n in range(count - 1)]
     distances = [right.distance] + [2 + n for n in range(count - 1)]
     translations = np.array(distances)[:, None] * right.translation
-    hypotheses = Hypotheses(np.stack([rotation, *wrong]), translations, np.array(log_odds))
+    hypotheses = Hypotheses(make_motion(np.stack([rotation, *wrong]), translations), np.array(log_odds))
     return replace(right, rotation=rotation, log_odds=max(log_odds), problem=problem, hypotheses=hypotheses)
 
 

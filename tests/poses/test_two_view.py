@@ -237,7 +237,7 @@ def _polish(bearings, prior: np.ndarray, sizes: np.ndarray) -> tuple[float, floa
     """Errors of a polished pose that was 0.5 degrees off."""
     start = rotation_exp(np.radians((0.3, -0.4, 0.0))) @ bearings.rotation
     indices = np.tile(np.arange(len(prior))[:, None], (1, 2))
-    figures = {"score": 99.0, "margin": 99.0, "places": 50.0, "uncertainty": (0.1, 0.1)}
+    figures = {"score": 99.0, "places": 50.0, "uncertainty": (0.1, 0.1)}
     relation = RelativePose(start, bearings.translation, indices[:8], distance=2.0, log_odds=9.0, **figures)
     polished = polish_relative_pose(relation, *features(bearings, sizes), Matches(indices, prior))
     assert (polished.distance, polished.log_odds) == (2.0, 9.0)

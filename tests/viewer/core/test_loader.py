@@ -165,7 +165,7 @@ def test_panoramas_are_shown_before_their_poses_are_estimated_but_not_if_these_a
     def estimate(folder, panoramas, *_):
         estimates.append([len(entries) for entries in shown])
         unplaced = {panorama.name: "bare walls" for panorama in panoramas}
-        return {"worlds": [], "unplaced": unplaced, "unreadable": []}
+        return {"worlds": [], "poses": {}, "estimate": {"unplaced": unplaced}, "unreadable": []}
 
     monkeypatch.setattr("pansplat.poses.files._estimate", estimate)
     for _ in range(2):
