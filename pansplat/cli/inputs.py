@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pansplat.tours.graph import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
-_PREDICTION_MEMORY, _SCENE_MEMORY = 2.3e9, 1e9  # bytes of the default prediction and refinement; of its scene
+_PREDICTION_MEMORY, _SCENE_MEMORY = 2.6e9, 1e9  # bytes of the default prediction and refinement; of its scene
 _READ_MEMORY, _PAGE_MEMORY = (
     14,
     42,

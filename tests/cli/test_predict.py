@@ -42,7 +42,7 @@ def test_a_command_says_what_memory_it_needs_if_less_is_free(room: Path, monkeyp
     for free, is_said in ((2e9, True), (4e9, False)):
         monkeypatch.setattr("pansplat.cli.inputs.measure_free_memory", lambda free=free: free)
         choose_source(room, PairChoice())
-        assert ("2.3 GB of memory, and 2.0 GB are free" in capsys.readouterr().err) == is_said
+        assert ("2.6 GB of memory, and 2.0 GB are free" in capsys.readouterr().err) == is_said
     assert measure_free_memory() > 0
 
 
