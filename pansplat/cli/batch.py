@@ -150,6 +150,7 @@ class Batch(Computation):
         from pansplat.inputs.panorama_sets import PanoramaSet
         from pansplat.system.store import hash_parts
         from pansplat.tours.graph import find_tours
+        from pansplat.tours.merge import describe_tour
 
         pairs, found = pipeline.load_sets(folder, **vars(self.reading)), {}
         tours = find_tours(pairs)
@@ -157,7 +158,7 @@ class Batch(Computation):
         for source in (*tours, *(pair for pair in pairs if pair.context[0].image not in images)):
             panoramas = list_panoramas(source)
             content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
-            edges = () if isinstance(source, PanoramaSet) else source.list_overlaps()
+            edges = () if isinstance(source, PanoramaSet) else describe_tour(source).overlaps
             for step in (step for step in STEPS if step in self.steps):
                 options = self.prediction
                 if step == "predict" or "refine" not in self.steps:

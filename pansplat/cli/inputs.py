@@ -16,7 +16,7 @@ from tyro.conf import arg
 from pansplat.errors import InputError
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.descriptions import describe_count
-from pansplat.system.devices import Device
+from pansplat.system.devices import Device, measure_free_memory
 from pansplat.system.files import is_scene_file
 from pansplat.system.options import Height
 from pansplat.system.progress import CONNECTED, POSED, stage
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from pansplat.tours.graph import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
+_PREDICTION_MEMORY, _SCENE_MEMORY = 2.6e9, 1e9  # bytes of the default prediction and refinement; of its scene
+# Bytes for a pixel of a photograph that is read, and of one in a page (docs/web.md).
+_READ_MEMORY, _PAGE_MEMORY = 14, 42
+_PAGE_ROWS = 4096  # most rows of a photograph in a page
 OptionalOut = Annotated[Path | None, arg(aliases=["-o"])]
 
 
@@ -103,6 +107,7 @@ def choose_source(path: Path, choice: PairChoice) -> PanoramaSet | TourGraph:
     from pansplat.tours.overlap import connect
 
     pairs = _load_sets(path, choice)
+    _note_memory(path, pairs)
     tours = [tour for tour in find_tours(pairs) if choice.pair in (None, tour.name)]
     if not tours:
         return _pick_set(path, pairs, choice)
@@ -132,6 +137,18 @@ def _load_sets(path: Path, choice: PairChoice) -> list[PanoramaSet]:
 
     with stage(POSED):
         return pipeline.load_sets(path, **vars(choice.reading))
+
+
+def _note_memory(path: Path, pairs: Sequence[PanoramaSet]) -> None:
+    """Print the memory that is needed if less is free. Photographs are read, and put into a page, one at a time."""
+    from pansplat.images.image_files import read_height
+
+    rows = max((read_height(view.image) for pair in pairs for view in pair.context), default=0)
+    tall = _READ_MEMORY * 2 * rows**2 + _PAGE_MEMORY * 2 * min(rows, _PAGE_ROWS) ** 2
+    needed, free = max(_PREDICTION_MEMORY, _SCENE_MEMORY + tall), measure_free_memory()
+    if needed > free:
+        have = f"takes about {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free"
+        print(f"note: {path}: {have}; photographs have up to {rows} rows, smaller copies take less", file=sys.stderr)
 
 
 def _pick_set(path: Path, pairs: list[PanoramaSet], choice: PairChoice) -> PanoramaSet:

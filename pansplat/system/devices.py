@@ -8,9 +8,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from pansplat.errors import InputError, InputWarning
@@ -27,6 +29,14 @@ _MIN_SECONDS = 5.0  # shortest work that `auto` gives to a card: CUDA and Triton
 
 _Say = Callable[[str], None]
 _current: ContextVar[tuple[Device, _Say | None]] = ContextVar("device", default=("auto", None))
+
+
+def measure_free_memory() -> float:
+    """Bytes of main memory that programs can use without swapping; infinite where the system does not state it."""
+    with contextlib.suppress(OSError, AttributeError):
+        found = re.search(r"MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text())
+        return 1024.0 * int(found[1]) if found else math.inf
+    return math.inf
 
 
 @contextlib.contextmanager

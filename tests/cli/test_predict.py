@@ -6,6 +6,8 @@ import torch
 
 from pansplat import pipeline
 from pansplat.cli import run
+from pansplat.cli.inputs import PairChoice, choose_source
+from pansplat.system.devices import measure_free_memory
 
 SPHERE = ["--model", "sphere", "--height", "64", "--refine", "0"]
 
@@ -34,6 +36,14 @@ def test_a_folder_of_three_panoramas_is_predicted_as_a_tour(tmp_path: Path, writ
     assert not layers.joint and len(layers.gaussians) > len(fused.gaussians)
     assert run([*command, str(tmp_path / "pair.glb"), "--pair", "2"]) == 0
     assert len(pipeline.load(tmp_path / "pair.glb").cam2world) == 2
+
+
+def test_a_command_says_what_memory_it_needs_if_less_is_free(room: Path, monkeypatch, capsys) -> None:
+    for free, is_said in ((2e9, True), (4e9, False)):
+        monkeypatch.setattr("pansplat.cli.inputs.measure_free_memory", lambda free=free: free)
+        choose_source(room, PairChoice())
+        assert ("2.6 GB of memory, and 2.0 GB are free" in capsys.readouterr().err) == is_said
+    assert measure_free_memory() > 0
 
 
 def test_each_surface_is_written_once_and_fitted_to_the_photographs(room: Path, tmp_path: Path) -> None:
