@@ -183,7 +183,8 @@ def test_the_export_of_a_refined_scene_is_refined(rooms: Path, tmp_path: Path, s
         do: Batch(rooms, tmp_path, do=do).list_commands(rooms / "room0") for do in ("export", "predict,refine,export")
     }
     limits = [
-        {name.split("-")[0]: e.prediction.options.refine_steps for name, e in each.items()} for each in steps.values()
+        {name.split("-")[0]: getattr(e.prediction, "options", e.prediction).refine_steps for name, e in each.items()}
+        for each in steps.values()
     ]
     assert limits == [{"export": 0}, {"predict": 0, "refine": None, "export": None}]
 

@@ -100,9 +100,12 @@ def test_no_export_repeats_the_metadata_of_the_photographs(tmp_path: Path, write
     (room / "poses.json").write_text(json.dumps(content))
     out = tmp_path / "out"
     out.mkdir()
-    for name in ("s.ply", "s.glb", "s.spz", "s.html", "page", "set"):
+    assert run(["predict", str(room), "-o", str(out / "s.ply"), "--model", "sphere", "--height", "64"]) == 0
+    for name in ("s.glb", "s.spz", "s.html", "page", "set"):
         kind = ["--training-set"] if name == "set" else []
-        assert run(["export", str(room), "-o", str(out / name), *kind, *OPTIONS]) == 0
+        source = out / "s.ply" if name in ("s.glb", "s.spz") else room
+        options = OPTIONS if source == room else []
+        assert run(["export", str(source), "-o", str(out / name), *kind, *options]) == 0
     for name in ("r.png", "r.jpg", "r.webp", "r.exr", "r.mp4"):
         assert run(["render", str(out / "s.ply"), "-o", str(out / name), "--height", "32"]) == 0
     files = [path for path in sorted(out.rglob("*")) if path.is_file()]

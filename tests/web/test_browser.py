@@ -34,6 +34,7 @@ from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.geometry.path import turn_axes
+from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.panorama_sets import Note, PanoramaSet
 from pansplat.notebook import _bundle_scene
@@ -542,9 +543,7 @@ def test_a_page_of_small_and_large_units_is_that_of_metres(
         with opened(chromium, path, size=(640, 480)) as page:
             position = page.run("HEADER.spots[0].position")
             for offset in (0.02, 0.1):
-                pose = {"position": [position[0] + offset, *position[1:]], "yaw": 0, "pitch": 0}
-                page.run("(pose) => pansplat.setPose(pose)", pose)
-                page.settle()
+                page.look(position=[position[0] + offset, *position[1:]], yaw=0, pitch=0)
                 seen.append(page.draw())
             page.page.keyboard.press("KeyM")
             page.settle()
