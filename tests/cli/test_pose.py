@@ -206,7 +206,7 @@ def test_commands_show_the_estimate_of_poses(command: str, folder: Path, tmp_pat
         raise NoPosesError(dict.fromkeys(images, "no door"))
 
     estimator(record)
-    out = tmp_path / ("view.png" if command == "render" else "view.ply")
+    out = tmp_path / {"render": "view.png", "export": "view.svg"}.get(command, "view.ply")
     run([command, str(folder), "--model", "sphere", "-o", str(out)])
     assert shown == [True]
 
