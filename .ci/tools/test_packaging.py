@@ -143,6 +143,7 @@ def test_the_python_of_the_readme_runs_from_an_installed_wheel(
         "images, cam2world = torch.rand(2, 3, 64, 128), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)\n"
         "cam2world[1, 0, 3] = 0.5\n"
         f"{code}\n"
+        "house = pansplat.predict('my_house')\n"
         "print(pansplat.__file__, *image.shape, len(house.cam2world), *picture.shape)\n"
     )
     output = run_in(tmp_path, environment / "bin" / "python", "-c", program).split()
