@@ -36,3 +36,14 @@ def test_pictures_are_as_good_as_they_were(shared: Path, folder: Path, views: in
         distance = float(load_lpips("squeeze", shared / "weights").distance(picture, target.images[0].float()))
     assert ws_psnr(picture, target.images[0]) > psnr - 10 * SPREAD_DB
     assert distance < lpips + 10 * SPREAD_LPIPS
+
+
+def test_the_refinement_of_the_sample_is_kept_and_shows_its_detail() -> None:
+    """Against 512 rows, 40 steps of layers gain 2.6 dB; half of that is asked."""
+    (panoramas,) = pansplat.load_sets(SAMPLE)
+    target, errors = panoramas.load_targets(512), []
+    for steps in (0, 40):
+        scene = pansplat.predict(panoramas, height=256, refine_steps=steps, joint=False, cache=False)
+        picture = pansplat.render(scene, target.cam2world[0], size=(512, 1024)).color.float()
+        errors.append(float(ws_psnr(picture, target.images[0])))
+    assert errors[1] - errors[0] > 1.3
