@@ -376,7 +376,8 @@ class _Painter:
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
         house = list(self.rooms.houses[panel.house])
         aside = np.linalg.norm((places[..., None, :] - self.eyes[house])[..., (0, 2)], axis=-1)
-        is_under = (aside < _TRIPOD * unit) & (offsets[..., 1:2] > 0.5 * unit)  # of each camera
+        # Whether each place is on the floor under each camera of the house, where its tripod stands.
+        is_under = (aside < _TRIPOD * unit) & (offsets[..., 1:2] > 0.5 * unit)
         cost = distance * (1 + (_HIDDEN - 1) * (1 - clear))
         # What stands before a tripod does not replace it.
         is_seen = is_shown | ((view in room.panoramas) & ~is_under.any(axis=-1))

@@ -28,7 +28,8 @@ _SAME_TURN = 0.05  # largest difference of an element of two rotations that are 
 _CLIMB = 0.3  # deviation of the difference of the cameras' heights over the floor, camera heights
 _KEPT, _FARTHEST = 8, 8.0  # hypotheses that are moved; largest distance of two cameras, camera heights
 _ALIKE = 1.5, -60.0, 10.0, 2.0, 5.0  # weights of the logarithm of votes, of conflict, likeness, shade and hue
-_STEPS, _ROUNDS = (0.08, 0.04, 0.02), 3  # of the search of the translation: camera heights; rounds with each step
+_STEPS = (0.08, 0.04, 0.02)  # steps of the search for the translation, over the height of the cameras
+_ROUNDS = 3  # rounds of that search with each step
 _AROUND = np.array([(x, y, 0.0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y])
 
 

@@ -207,7 +207,8 @@ def _floor_evidence(
     seen &= deviation > _MIN_DEVIATION
     area = np.sqrt(np.maximum(1 - down**2, 0)) * seen
     padded = cv2.copyMakeBorder(other.astype(np.float32), 0, 0, 2, 2, cv2.BORDER_WRAP)
-    toward_floor = rays / np.maximum(down, 1e-3)[..., None] @ other_pose[:3, :3]  # for a floor one unit below
+    # Rays that end on a floor one unit below the camera, in the axes of the other one.
+    toward_floor = rays / np.maximum(down, 1e-3)[..., None] @ other_pose[:3, :3]
     x, y, z = np.moveaxis(toward_floor.astype(np.float32), -1, 0)
     offset = ((pose[:3, 3] - other_pose[:3, 3]) @ other_pose[:3, :3]).astype(np.float32)
     turn = np.float32(rows / math.pi)

@@ -73,7 +73,7 @@ def test_what_masks_hide_shows_the_gaussians(photographs: list[PanoramaSet]) -> 
     pose = move(1, 0.0)
     image = FilmPhotographs(photographs, POSES).cover(1, 0.75, pose, PLANE, lambda: GAUSSIANS)
     photograph = directions(pose)
-    height = 1 - 2 * photograph[..., 1]  # of a direction above the horizon
+    height = 1 - 2 * photograph[..., 1]  # sine of the elevation of each pixel
     for chosen, shown in ((height > 0, GAUSSIANS), (height < -0.1, photograph)):
         assert chosen.sum() > 200
         assert np.abs(image - (0.25 * GAUSSIANS + 0.75 * shown))[chosen].max() < 0.01

@@ -158,7 +158,7 @@ def test_unfinished_files_of_killed_processes_are_removed(folder: Path) -> None:
             raise KeyboardInterrupt
     old, new = unfinished
     for file in unfinished:
-        file.write_bytes(b"half")  # as if the process had been killed
+        file.write_bytes(b"half")  # the content after a process that was killed while it wrote
     os.utime(old, (1e9, 1e9))
     Store(folder).write("view", "key", 1)
     assert set(cache.iterdir()) == {new, *Store(folder).find("view", "key")}

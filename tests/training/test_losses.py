@@ -150,7 +150,7 @@ def test_depth_outside_the_range_is_unknown(form, unknown: float) -> None:
 @pytest.mark.parametrize("form", ["depth", "inverse_depth"])
 def test_masked_depth_and_that_beyond_a_views_range_do_not_affect_the_loss(form) -> None:
     (level,), (truth,) = depths(16), depths(16, seed=1)
-    far = torch.tensor([[FAR, 0.9]], dtype=torch.float64)  # below all depths of the second view
+    far = torch.tensor([[FAR, 0.9]], dtype=torch.float64)  # largest depths; all depths of the second view are larger
     both = depth_loss([level], truth, torch.full_like(far, NEAR), far, form=form)
     assert float(both) == pytest.approx(float(depth_loss([level[:, :1]], truth[:, :1], NEAR, FAR, form=form)))
     masks = torch.ones(1, 2, 16, 32, dtype=torch.bool)

@@ -43,7 +43,7 @@ class DrawSettings:
     display_max: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0, 1]
     near: float = NEAR  # Gaussians whose mean is nearer than this radial distance, metres, are not drawn
-    vertical_fov_degrees: float = 90.0  # in (0, 180)
+    vertical_fov_degrees: float = 90.0  # vertical field of view of pinhole images, between 0 and 180 degrees
     cached: bool = False
     scale: float = 1.0
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)  # of an image along each side; few, because a new size allocates new textures
+# Sides of a drawn image over those of the window; few, because a new size allocates new textures.
+SCALES = (1.0, 0.75, 0.5, 0.35, 0.25)
 BUDGET_MS = 50.0  # longest time of a frame while the camera moves: 20 frames a second are still smooth
 SETTLE_AFTER = 0.2  # time from the last movement to the image at full resolution, seconds
 
