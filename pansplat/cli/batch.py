@@ -70,7 +70,7 @@ class Batch(Computation):
     format: Literal["html", "svg", "png", "ply", "compressed.ply", "spz", "splat", "sog", "glb"] = "html"
     """Format of the export: a web page, a floor plan (svg, png), or a scene."""
     gaussians: Count | None = None
-    """For html: largest number of Gaussians, 450,000 by default."""
+    """For html: largest number of Gaussians, by default 300,000 to 450,000."""
     workers: Threads | None = None
     """Number of worker processes on this machine; by default one per two cores with at least 4 GiB each."""
     scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None

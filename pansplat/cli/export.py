@@ -149,11 +149,11 @@ class Page:
             pictures = f" {describe_count(len(photographs), 'photograph')} of {kept}{all_kept},"
         how = "upload them, or show them with --serve" if split else "open it in a browser"
         print(f"{out}{beside}: {page.num_gaussians:,} Gaussians,{pictures} {page.num_bytes / 1e6:.1f} MB; {how}")
-        if page.fades:
-            flights, fades = describe_count(page.num_flights, "flight"), describe_count(len(page.fades), "fade")
-            names = list_first([" and ".join(ends) for ends in page.fades])
+        if page.zooms:
+            flights, zooms = describe_count(page.num_flights, "flight"), describe_count(len(page.zooms), "zoom")
+            names = list_first([" and ".join(ends) for ends in page.zooms])
             print(
-                f"note: {out}: {flights} between panoramas, and {fades} ({names}), because their surfaces disagree; "
+                f"note: {out}: {flights} between panoramas, and {zooms} ({names}), because their surfaces disagree; "
                 "one more photograph between two such panoramas would help",
                 file=sys.stderr,
             )

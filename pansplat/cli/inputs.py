@@ -143,7 +143,7 @@ def _note_memory(path: Path, pairs: Sequence[PanoramaSet]) -> None:
     """Print the memory that is needed if less is free. Photographs are read, and put into a page, one at a time."""
     from pansplat.images.image_files import read_height
 
-    rows = max((read_height(view.image) for pair in pairs for view in pair.context), default=0)
+    rows = max(map(read_height, {view.image for pair in pairs for view in pair.context}), default=0)
     tall = _READ_MEMORY * 2 * rows**2 + _PAGE_MEMORY * 2 * min(rows, _PAGE_ROWS) ** 2
     needed, free = max(_PREDICTION_MEMORY, _SCENE_MEMORY + tall), measure_free_memory()
     if needed > free:

@@ -102,7 +102,7 @@ class PageFiles:
         num_gaussians: in the page.
         photo_height: of its photographs, pixels; 0 without photographs.
         num_flights: number of edges along which it flies.
-        fades: labels of the two panoramas of each edge along which it fades.
+        zooms: labels of the two panoramas of each edge along which it zooms.
         num_outside: panoramas without doll's house.
     """
 
@@ -111,7 +111,7 @@ class PageFiles:
     num_gaussians: int
     photo_height: int = 0
     num_flights: int = 0
-    fades: tuple[tuple[str, str], ...] = ()
+    zooms: tuple[tuple[str, str], ...] = ()
     num_outside: int = 0
 
 
@@ -224,7 +224,7 @@ class _Flights:
     """How the camera moves.
 
     Attributes:
-        parts: of each view; the camera moves within a part, and the image fades to another one.
+        parts: of each view; the camera moves within a part, and zooms to another one.
         groups: views that are blended together.
         edges: two views and the group that is blended between them; without edges all views are blended.
         walk: all views, in the order of a visit.
@@ -565,9 +565,9 @@ def _write_files(
     files.insert(0, path)
     total = len(page) + sum(map(len, parts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
-    fades = tuple((names[a], names[b]) for a, b in header["poor"])
-    num_flights = sum(a != b for a, b, _ in header["edges"]) - len(fades)
-    return PageFiles(tuple(files), total, count, photo_height, num_flights, fades)
+    zooms = tuple((names[a], names[b]) for a, b in header["poor"])
+    num_flights = sum(a != b for a, b, _ in header["edges"]) - len(zooms)
+    return PageFiles(tuple(files), total, count, photo_height, num_flights, zooms)
 
 
 def _name_part(label: str, content: bytes, suffix: str) -> str:

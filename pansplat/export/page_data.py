@@ -39,7 +39,7 @@ _CLIPPED = 1e-3  # fraction of colours beyond each end of the range of bytes
 Vector: TypeAlias = tuple[float, float, float]  # axes of the scene's world, relative to the page's origin
 
 
-class _Record(msgspec.Struct, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=True):
+class _Record(msgspec.Struct, frozen=True, rename="camel", forbid_unknown_fields=True):
     """A JSON object of a page."""
 
 

@@ -27,8 +27,9 @@ from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import assign_storeys
+from pansplat.tours.floor import list_pieces
 from pansplat.tours.layout import arrange_in_rows
+from pansplat.tours.linked_rooms import turn_plan
 from pansplat.tours.plan import Plan, Room
 
 SUFFIXES = (".svg", ".png")
@@ -187,15 +188,14 @@ class _Drawing:
     @cached_property
     def _pieces(self) -> list[tuple[int, int]]:
         """World and storey in which each panorama is drawn."""
-        pieces = list(zip(self.plan.tour.worlds, assign_storeys(self.plan.tour), strict=True))
+        pieces = list_pieces(self.plan.tour)
         drawn = self.plan.drawn
         return [pieces[drawn[node].beside] if node in drawn else piece for node, piece in enumerate(pieces)]
 
     @cached_property
     def _turns(self) -> Float[np.ndarray, "world 2 2"]:
         """For each world the rotation, applied from the right, after which its longest wall is horizontal."""
-        cosines, sines = np.cos(self.plan.turns), np.sin(self.plan.turns)
-        return np.stack((cosines, sines, -sines, cosines), axis=1).reshape(-1, 2, 2)
+        return np.stack([turn_plan(-turn) for turn in self.plan.turns])
 
     @cached_property
     def _centers(self) -> Float[np.ndarray, "node 2"]:

@@ -89,7 +89,7 @@ def render(
     if scene.tour:
         tour = make_graph(scene)
         edge, _ = tour.find_nearest_edge(pose[:3, 3].detach().cpu().numpy())
-        shown = [view for view in shown if not tour.is_fade(view, edge[0])]
+        shown = [view for view in shown if tour.parts[view] == tour.parts[edge[0]]]
         group = list(choose_scene_views(tour)[edge])
     if blend == "joint" or num_views < 2:
         gaussians = scene.gaussians

@@ -172,3 +172,8 @@ def assign_storeys(tour: TourGraph) -> list[int]:
         levels = np.sort([np.median(own[storey]) for storey in find_storeys(own)])
         storeys[worlds == world] = np.abs(own[:, None] - levels).argmin(axis=1)
     return storeys.tolist()
+
+
+def list_pieces(tour: TourGraph) -> list[tuple[int, int]]:
+    """The world of each panorama, and its storey there: those of a piece are drawn together."""
+    return list(zip(tour.worlds, assign_storeys(tour), strict=True))

@@ -49,7 +49,7 @@ class TourGraph:
         originals: the panoramas with poses in their own worlds, which scenes are predicted from; none if these
             are `panoramas`.
         walls: pairs of panoramas of one world between which is a wall or a closed door; they are no edges.
-        poor: edges along which the image fades, because the surfaces of their panoramas disagree (`find_poor_edges`).
+        poor: edges along which the camera zooms, because the surfaces of their panoramas disagree (`find_poor_edges`).
         clearances: of panoramas whose surfaces are known (`measure_clearance`, relative to `level_axes`).
     """
 
@@ -197,8 +197,8 @@ class TourGraph:
         fractions = ((position - a) * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-12)
         return np.linalg.norm(position - (a + np.clip(fractions, 0, 1)[:, None] * along), axis=1)
 
-    def is_fade(self, start: int, end: int) -> bool:
-        """Whether a step of a walk is a fade: its nodes are of different parts, or its edge is poor."""
+    def is_zoom(self, start: int, end: int) -> bool:
+        """Whether a step of a walk is a zoom: its nodes are of different parts, or its edge is poor."""
         return self.parts[start] != self.parts[end] or (min(start, end), max(start, end)) in self.poor
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from shapely.geometry import Polygon
 
 from pansplat.system.components import label_components
-from pansplat.tours.floor import FloorOutline, assign_storeys, choose_camera_height
+from pansplat.tours.floor import FloorOutline, choose_camera_height, list_pieces
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
 from pansplat.tours.surfaces import RAY_ANGLES, RAY_DIRECTIONS, RAYS, Outline, Surfaces, meet_outline, split_by_azimuth
@@ -195,14 +195,15 @@ def make_plan(
     count, unit = len(tour), choose_camera_height(heights, tour.far)
     seen = zip(surfaces, heights, ceilings, floors, strict=True)
     sights = [_look(own, height or unit, ceiling, floor) for own, height, ceiling, floor in seen]
-    storeys, parts = assign_storeys(tour), tour.worlds
+    pieces, worlds = list_pieces(tour), tour.worlds
     rooms: list[Room] = []
-    for part, storey in sorted({*zip(parts, storeys, strict=True)}):
-        members = [k for k in range(count) if sights[k] is not None and (parts[k], storeys[k]) == (part, storey)]
-        in_part = [sights[k] for k in range(count) if sights[k] is not None and parts[k] == part]
-        normals = _find_directions(in_part, unit) if in_part else np.eye(2)
+    for piece in sorted({*pieces}):
+        world, storey = piece
+        members = [k for k in range(count) if sights[k] is not None and pieces[k] == piece]
+        in_world = [sights[k] for k in range(count) if sights[k] is not None and worlds[k] == world]
+        normals = _find_directions(in_world, unit) if in_world else np.eye(2)
         found = [(*room, True) for room in _outline_rooms(sights, members, normals, unit)] if members else []
-        free = {k for k in range(count) if (parts[k], storeys[k]) == (part, storey)}.difference(*(n for n, *_ in found))
+        free = {k for k in range(count) if pieces[k] == piece}.difference(*(n for n, *_ in found))
         for view in sorted(free):  # those in a room come last in it
             point = shapely.Point(surfaces[view].center[[0, 2]])
             inside = [n for n, (_, outline, _) in enumerate(found) if Polygon(outline).contains(point)]
@@ -215,7 +216,7 @@ def make_plan(
         for nodes, outline, is_closed in found:
             is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
             rooms.append(Room(_name_room(tour, nodes), nodes, outline, storey, is_placed, is_closed))
-    disagreement, num_walls = _measure_walls([room for room in rooms if room.is_closed], sights, parts, unit)
+    disagreement, num_walls = _measure_walls([room for room in rooms if room.is_closed], sights, worlds, unit)
     scale = float(1.4826 * np.median(np.abs(known - unit)) / unit) if len(known) > 2 else None
     doors = _find_doors(rooms, sights, unit)
     return Plan(tour, tuple(rooms), doors, unit, scale, disagreement, len(known), num_walls)
@@ -473,8 +474,10 @@ def _outline_rooms(
     shapes: list[tuple[tuple[int, ...], shapely.Geometry]] = []
     for label in np.unique(labels):
         nodes = tuple(traced[k] for k in np.flatnonzero(labels == label))
-        lines = _find_lines([seen[k] for k in nodes], normals, unit)
-        outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]
+        outlines = [alone[k] for k in nodes]
+        if len(nodes) > 1:
+            lines = _find_lines([seen[k] for k in nodes], normals, unit)
+            outlines = [_trace_outline(seen[k], lines, unit) or alone[k] for k in nodes]
         shapes.append((nodes, _clean(shapely.union_all(outlines), unit)))
     pieces = [
         (nodes, piece) for nodes, shape in _separate(shapes, seen) for piece in shapely.get_parts(_clean(shape, unit))
@@ -523,12 +526,12 @@ def _separate(
 
 
 def _measure_walls(
-    rooms: Sequence[Room], sights: Sequence[_Sight | None], parts: Sequence[int], unit: float
+    rooms: Sequence[Room], sights: Sequence[_Sight | None], worlds: Sequence[int], unit: float
 ) -> tuple[float | None, int]:
     """Standard deviation of a wall by the panoramas that show it from the room's side, and the number of such walls."""
     variances = []
     for room in rooms:
-        near_room = [s for k, s in enumerate(sights) if s is not None and parts[k] == parts[room.panoramas[0]]]
+        near_room = [s for k, s in enumerate(sights) if s is not None and worlds[k] == worlds[room.panoramas[0]]]
         for start, end in zip(room.outline, np.roll(room.outline, -1, axis=0), strict=True):
             length = float(np.linalg.norm(end - start))
             if length < 2 * _LEAST_WALL * unit:

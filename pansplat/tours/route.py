@@ -230,7 +230,7 @@ class _Planner:
     def go(self, node: int, after: Sequence[int]) -> None:
         """Go to a panorama, after which another one may follow."""
         before = self.node
-        if before is not None and self.tour.is_fade(before, node):
+        if before is not None and self.tour.is_zoom(before, node):
             self.turn(self.find_way(before, node))
             self.add("zoom", (*self.places[node], *self.find_arrival(before, node)), ZOOM_SECONDS, node)
         elif before != node:
@@ -239,7 +239,7 @@ class _Planner:
             self.fly(node)
         self.following += 1
         if self.edge is None or node not in self.edge:
-            is_flown = len(after) > 0 and not self.tour.is_fade(node, after[0])
+            is_flown = len(after) > 0 and not self.tour.is_zoom(node, after[0])
             self.edge = (min(node, after[0]), max(node, after[0])) if is_flown else self.tour.find_edge(node)
 
     def fly(self, node: int) -> None:
@@ -257,7 +257,7 @@ class _Planner:
     def find_way(self, start: int, end: int) -> tuple[float, float] | None:
         """Yaw and pitch from a panorama to another one: of its place, or of the link to it; None if unknown."""
         link, away = self.tour.find_direction(start, end), self.places[end] - self.places[start]
-        if link is not None and self.tour.is_fade(start, end):
+        if link is not None and self.tour.is_zoom(start, end):
             yaw, pitch = find_angles(link)
             return yaw, max(pitch, LOWEST_PITCH)
         return (math.atan2(away[0], away[2]), 0.0) if self.tour.worlds[start] == self.tour.worlds[end] else None

@@ -1,4 +1,4 @@
-"""Walks through a tour: the cheapest ways along edges and fades, and one that visits all panoramas."""
+"""Walks through a tour: the cheapest ways along edges and zooms, and one that visits all panoramas."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from jaxtyping import Float, Int
 from pansplat.tours.graph import TourGraph
 
 _MAX_STARTS = 10_000  # starts of a walk that are compared, times the number of nodes
-_LINKED_FADE = 0.5  # cost of a fade along a link, as a fraction of far
-_UNLINKED_FADE = 2.5  # cost of another fade, as a factor, so that two fades along links cost less
+_LINKED_ZOOM = 0.5  # cost of a zoom along a link, as a fraction of far
+_UNLINKED_ZOOM = 2.5  # cost of another zoom, as a factor, so that two zooms along links cost less
 
 
 def find_walk(tour: TourGraph, start: int, end: int) -> list[int]:
-    """The nodes of the cheapest way along edges and fades, both ends included.
+    """The nodes of the cheapest way along edges and zooms, both ends included.
 
     It stays in the part of both ends, if they are of one part.
     """
@@ -33,7 +33,7 @@ def find_walk(tour: TourGraph, start: int, end: int) -> list[int]:
 def find_way(tour: TourGraph, position: Float[np.ndarray, "3"], node: int, part: int | None = None) -> list[int]:
     """The nodes on the way from a position to a node: from that end of the nearest edge which makes it better.
 
-    The better way has fewer fades. Of those with as many, it is the shorter one.
+    The better way has fewer zooms. Of those with as many, it is the shorter one.
 
     Args:
         position: of the camera.
@@ -43,9 +43,9 @@ def find_way(tour: TourGraph, position: Float[np.ndarray, "3"], node: int, part:
     nearest, _ = tour.find_nearest_edge(position, part)
 
     def measure(walk: list[int]) -> tuple[int, float]:
-        fades = [tour.is_fade(a, b) for a, b in itertools.pairwise(walk)]
+        zooms = [tour.is_zoom(a, b) for a, b in itertools.pairwise(walk)]
         steps = np.linalg.norm(np.diff([position, *tour.positions[walk]], axis=0), axis=1)
-        return sum(fades), float(steps[~np.array([False, *fades])].sum())
+        return sum(zooms), float(steps[~np.array([False, *zooms])].sum())
 
     ends: Sequence[int] = nearest
     if nearest in tour.poor:  # no camera flies to its other end
@@ -61,7 +61,7 @@ def find_next_nodes(tour: TourGraph) -> list[list[int]]:
 
 
 def plan_walk(tour: TourGraph, start: int | None = None) -> list[int]:
-    """Nodes of a short walk along edges and fades that visits all nodes; some of them more than once.
+    """Nodes of a short walk along edges and zooms that visits all nodes; some of them more than once.
 
     Nearest neighbours first, improved by exchanging parts of the order (2-opt).
 
@@ -129,12 +129,12 @@ def _find_shortest(tour: TourGraph) -> tuple[Float[np.ndarray, "node node"], Int
     ways, previous = find_ways(costs)
     is_near = np.isfinite(ways)
     if not is_near.all():
-        # Two fades cost more than each way within a part, so that a way between nodes of a part stays in it.
+        # Two zooms cost more than each way within a part, so that a way between nodes of a part stays in it.
         longest = ways[is_near].max()
-        fade = 0.5 * longest + _LINKED_FADE * tour.far
-        costs[~is_near] = _UNLINKED_FADE * fade + longest
+        zoom = 0.5 * longest + _LINKED_ZOOM * tour.far
+        costs[~is_near] = _UNLINKED_ZOOM * zoom + longest
         for a, b in (*tour.links, *tour.walls):
             if tour.parts[a] != tour.parts[b]:
-                costs[a, b] = costs[b, a] = fade
+                costs[a, b] = costs[b, a] = zoom
         ways, previous = find_ways(costs)
     return ways, previous

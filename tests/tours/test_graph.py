@@ -115,7 +115,7 @@ def test_a_link_is_a_direction_in_the_world(home):
 def test_no_flight_leads_through_a_wall_and_places_stay_known(comb):
     tour = comb.with_walls([(1, 2)])
     assert (1, 2) not in tour.overlaps and tour.parts == (0, 0, 1, 1, 0, 1) and set(tour.worlds) == {0}
-    assert tour.is_fade(1, 2) and find_walk(tour, 0, 3) == [0, 1, 2, 3] and not comb.is_fade(1, 2)
+    assert tour.is_zoom(1, 2) and find_walk(tour, 0, 3) == [0, 1, 2, 3] and not comb.is_zoom(1, 2)
     tour = tour.with_walls([(2, 5)])
     assert tour.overlaps[5, 5] == 1 and tour.is_placed(5), "a panorama behind walls is in the world of the others"
     assert leave_out(tour, 5).context and set(plan_walk(tour)) == set(range(6))

@@ -39,7 +39,7 @@ def test_a_walk_through_a_hundred_panoramas_of_a_grid_is_hardly_longer_than_the_
 def test_walks_fade_between_parts_preferably_along_links(home):
     walk = plan_walk(home)
     assert set(walk) == set(range(7)) and walk[:5] == [0, 1, 2, 3, 6], "from the first panorama on, along links"
-    flown = [(min(step), max(step)) for step in itertools.pairwise(walk) if not home.is_fade(*step)]
+    flown = [(min(step), max(step)) for step in itertools.pairwise(walk) if not home.is_zoom(*step)]
     assert len(walk) - len(flown) == 4 and set(flown) <= set(home.overlaps), "three fades"
     assert find_walk(home, 0, 6) == [0, 1, 2, 3, 6] and find_walk(home, 6, 0) == [6, 3, 2, 1, 0]
     assert find_walk(home, 0, 5) == [0, 5], "no link leads there"
@@ -71,4 +71,4 @@ def test_a_poor_edge_is_a_fade_in_its_part_and_ways_around_it_are_better(make_to
     square = make_tour(((0, 0), (0, 2), (2, 2), (2, 0)), ((0, 1), (1, 2), (2, 3), (0, 3)))
     poor = dataclasses.replace(square, poor=((0, 1),))
     assert find_walk(square, 0, 1) == [0, 1] and find_walk(poor, 0, 1) == [0, 3, 2, 1]
-    assert poor.is_fade(0, 1) and poor.is_fade(1, 0) and not poor.is_fade(1, 2) and poor.parts == square.parts
+    assert poor.is_zoom(0, 1) and poor.is_zoom(1, 0) and not poor.is_zoom(1, 2) and poor.parts == square.parts

@@ -745,7 +745,7 @@ def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(m
     app.state.camera = replace(app.state.camera, pitch_radians=-0.25, yaw_radians=-0.1)
     app.frames(2)
     (spot,) = [spot for spot in app.viewer.hotspots if not spot.is_arrow]
-    assert (spot.node, spot.label, spot.is_fade) == (3, "to the hall", True)
+    assert (spot.node, spot.label, spot.is_zoom) == (3, "to the hall", True)
     left, stage = app.viewer.stage.slot.scene, app.viewer.stage
     click_on(app, 3)
     app.until(lambda: app.session.tour.part == 1, "fade", 0.2)

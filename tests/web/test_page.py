@@ -165,15 +165,15 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
 
 def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = write_page(house, tmp_path / "good.html")
-    assert (good.num_flights, good.fades) == (2, ())
+    assert (good.num_flights, good.zooms) == (2, ())
     monkeypatch.setattr(edges, "POOR", -9)
     poor = write_page(house, tmp_path / "poor.html")
     header = read_header(tmp_path / "poor.html")
-    assert (poor.num_flights, len(poor.fades)) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
-    assert poor.fades == tuple(zip(house.names[:2], house.names[1:], strict=True)), "the labels"
+    assert (poor.num_flights, len(poor.zooms)) == (0, 2) and header["poor"] == [[0, 1], [1, 2]]
+    assert poor.zooms == tuple(zip(house.names[:2], house.names[1:], strict=True)), "the labels"
     assert set(header["parts"]) == {0} and header["walk"] == [0, 1, 2]
     joint = dataclasses.replace(house, joint=True, tour=None)
-    assert write_page(joint, tmp_path / "joint.html").fades == ()
+    assert write_page(joint, tmp_path / "joint.html").zooms == ()
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_walk(house: Scene, tmp_path: Path) -> None:

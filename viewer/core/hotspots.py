@@ -49,7 +49,7 @@ class Hotspot:
         center: pixels, from the left and from the top.
         radius: pixels, within which a click is meant.
         ring: corners of the circle on the floor, or upright on a wall, or of the arrow, pixels.
-        is_fade: whether the panorama is in another part, to which the image fades.
+        is_zoom: whether the way to the panorama is a zoom (`TourGraph.is_zoom`).
         is_arrow: whether it is an arrow.
     """
 
@@ -58,7 +58,7 @@ class Hotspot:
     center: tuple[float, float]
     radius: float
     ring: tuple[tuple[float, float], ...]
-    is_fade: bool = False
+    is_zoom: bool = False
     is_arrow: bool = False
 
 
@@ -91,19 +91,19 @@ def find_hotspots(
         if np.linalg.norm(tour.positions[node] - position) >= RING_DISTANCE
     }
     for node, link in links.items():
-        if (node in hidden or tour.is_fade(here, node)) and node not in feet:
+        if (node in hidden or tour.is_zoom(here, node)) and node not in feet:
             ring = find_link_ring(tour, here, node, facts.camera_height, facts.outlook)
             if ring is not None:
                 feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
     found: list[Hotspot] = []
     arrows: list[Hotspot] = []
     for node, (foot, label) in sorted(feet.items(), key=lambda item: -np.linalg.norm(item[1][0] - position)):
-        is_fade, is_upright = tour.is_fade(here, node), bool((foot - position - below) @ below < -1e-6)
-        hotspot = _make_hotspot(camera, size, node, label, foot, is_fade=is_fade, is_upright=is_upright)
+        is_zoom, is_upright = tour.is_zoom(here, node), bool((foot - position - below) @ below < -1e-6)
+        hotspot = _make_hotspot(camera, size, node, label, foot, is_zoom=is_zoom, is_upright=is_upright)
         if hotspot is not None and hotspot.center[0] >= left:
             found.append(hotspot)
         else:
-            arrows.append(_make_arrow(camera, size, left, node, label, foot, is_fade, arrows))
+            arrows.append(_make_arrow(camera, size, left, node, label, foot, is_zoom, arrows))
     return arrows + found
 
 
@@ -114,7 +114,7 @@ def _make_hotspot(
     label: str,
     foot: Float[np.ndarray, "3"],
     *,
-    is_fade: bool,
+    is_zoom: bool,
     is_upright: bool,
 ) -> Hotspot | None:
     """The hotspot of a panorama around a place on the floor or a wall; None if it is not in an image of this size."""
@@ -130,7 +130,7 @@ def _make_hotspot(
     radius = float(np.ptp([corner[0] for corner in ring])) / 2
     shrunk = np.array(center) + min(_MAX_PIXELS / max(radius, 1e-9), 1.0) * (np.array(ring) - center)
     return Hotspot(
-        node, label, center, min(max(radius, _MIN_PIXELS), _MAX_PIXELS), tuple(map(tuple, shrunk.tolist())), is_fade
+        node, label, center, min(max(radius, _MIN_PIXELS), _MAX_PIXELS), tuple(map(tuple, shrunk.tolist())), is_zoom
     )
 
 
@@ -141,7 +141,7 @@ def _make_arrow(
     node: int,
     label: str,
     foot: Float[np.ndarray, "3"],
-    is_fade: bool,
+    is_zoom: bool,
     others: Sequence[Hotspot],
 ) -> Hotspot:
     """The arrow to which the camera turns to see a place, beside `others`: at the side, or at the lower border."""
@@ -160,7 +160,7 @@ def _make_arrow(
         center = center + step
     x, y = center.tolist()
     ring = tuple(map(tuple, (center + _ARROW @ turn.T).tolist()))
-    return Hotspot(node, label, (x, y), _MIN_PIXELS, ring, is_fade, is_arrow=True)
+    return Hotspot(node, label, (x, y), _MIN_PIXELS, ring, is_zoom, is_arrow=True)
 
 
 def find_clicked(hotspots: Sequence[Hotspot], pixel: tuple[float, float]) -> int | None:

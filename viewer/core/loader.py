@@ -99,7 +99,9 @@ def find_entries(
         show: called before poses are estimated, with the panoramas as a tour of which none is placed.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder; give a pair folder, a folder of pairs or a scene file")
+        raise InputError(
+            f"{path}: no such file or folder; give a panorama, a folder of panoramas, a folder of such folders or a scene file"
+        )
     if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
     scenes = sorted(p for p in path.iterdir() if is_scene_file(p)) if path.is_dir() else []
@@ -257,7 +259,7 @@ def _choose_first_scene(tour: "TourGraph", walked: "TourGraph") -> tuple[int, tu
     from pansplat.tours.walks import plan_walk
 
     first, *others = plan_walk(walked)
-    is_flown = others and not walked.is_fade(first, others[0])
+    is_flown = others and not walked.is_zoom(first, others[0])
     edge = (min(first, others[0]), max(first, others[0])) if is_flown else tour.find_edge(first)
     scenes = choose_scene_views(tour)
     return first, scenes.get(edge) or scenes[tour.find_edge(first)]

@@ -139,7 +139,7 @@ class Minimap:
         for a, b in tour.overlaps:
             canvas.add_line(self.nodes[a], self.nodes[b], colors[2], scale)
         for a, b in tour.links:
-            if tour.is_fade(a, b):
+            if tour.is_zoom(a, b):
                 canvas.add_line(self.nodes[a], self.nodes[b], colors[4], scale)
         loaded, half = {node for views in scenes.loaded for node in views}, 3.5 * scale
         for node, (x, y) in enumerate(self.nodes):

@@ -55,7 +55,7 @@ def draw_hotspots(hotspots: list[Hotspot]) -> None:
     black, white, amber = (imgui.color_convert_float4_to_u32((*rgb, 0.8)) for rgb in ((0,) * 3, (1,) * 3, FADE_COLOR))
     for hotspot in hotspots:
         ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
-        for color, thickness in ((black, 4.0), (amber if hotspot.is_fade else white, 2.0)):
+        for color, thickness in ((black, 4.0), (amber if hotspot.is_zoom else white, 2.0)):
             canvas.add_polyline(ring, color, thickness=thickness, flags=imgui.ImDrawFlags_.closed.value)
             if hotspot.is_arrow:
                 canvas.add_convex_poly_filled(ring, color)

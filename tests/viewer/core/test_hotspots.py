@@ -26,7 +26,7 @@ def test_the_hotspot_of_a_link_is_where_it_meets_the_floor_or_a_wall(parted_hous
     scenes.move(parted_house.positions[2])
     camera = Camera(position=(0.0, 0.0, 1.6), vertical_fov_degrees=120.0)
     (hotspot,) = find_rings(scenes, camera, (200, 200))
-    assert (hotspot.node, hotspot.label, hotspot.is_fade) == (3, "to the hall", True)
+    assert (hotspot.node, hotspot.label, hotspot.is_zoom) == (3, "to the hall", True)
     focal = 100 / np.tan(np.radians(60))
     assert hotspot.center == pytest.approx((100 + focal * np.tan(0.1), 100 + focal * np.tan(0.6) / np.cos(0.1)))
     scenes.move(parted_house.positions[3])

@@ -133,7 +133,7 @@ def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(hous
     assert [step.kind for step in scenes.plan_way(house.cam2world[0].numpy(), (2,)).steps] == ["zoom", "flight"]
     camera = Camera(position=tuple(house.positions[0].tolist()))
     (hotspot,) = find_hotspots(scenes.tour, scenes.find_place(house.positions[0]), camera, (200, 200))
-    assert hotspot.node == 1 and hotspot.is_fade, "a ring leads through the wall"
+    assert hotspot.node == 1 and hotspot.is_zoom, "a ring leads through the wall"
 
 
 def test_a_scene_between_two_predictions_has_the_gaussians_of_both(house, load_house, monkeypatch):
