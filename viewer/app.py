@@ -69,7 +69,7 @@ class Options:
     size: str | None = None
     """Width x height, pixels (window 1280x720, film 1920x1080)."""
     seconds: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Length of the film; by default that of the ways through all panoramas."""
+    """Length of the film; by default that of the ways through all panoramas, or 4 around a scene without cameras."""
     fps: Annotated[float, Meta(gt=0, le=240)] = 24.0
     """Frames per second of the film."""
 
@@ -223,12 +223,12 @@ def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple
             print(file, flush=True)
 
         loaded = load(entry, _PREDICTION_PART)
-        scene, tour, settings = loaded.scene, loaded.entry.tour, fit_settings(_SETTINGS, loaded.scene)
-        scenes = None if tour is None else TourScenes.start(loaded)
+        settings = fit_settings(_SETTINGS, loaded.scene)
+        scenes = None if loaded.entry.tour is None else TourScenes.start(loaded)
         create = partial(create_renderer, ctx, options.renderer, color_bits=32)
         try:
             with open_film(create, loaded, scenes, load, pixels, settings) as film:
-                write_flight(film, scene, tour, folder, options.fps, options.seconds, show_file)
+                write_flight(film, loaded, scenes, folder, options.fps, options.seconds, show_file)
         finally:
             if ctx is not None:
                 ctx.release()

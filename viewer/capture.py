@@ -1,4 +1,4 @@
-"""Files that `pansplat-view` writes without a window: films of flights and of camera paths, with stills."""
+"""Files that `pansplat-view` writes without a window: films of ways, and of turns around scenes, with stills."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ import numpy as np
 from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
-from pansplat.tours.graph import TourGraph
-from pansplat.tours.merge import make_graph
 from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
 from pansplat.tours.walks import plan_walk
 from pansplat_viewer.core import camera as cameras
@@ -94,8 +92,8 @@ def open_film(
 
 def write_flight(
     film: Film,
-    scene: Scene,
-    tour: TourGraph | None,
+    loaded: LoadedScene,
+    scenes: TourScenes | None,
     folder: Path,
     fps: float,
     seconds: float | None,
@@ -103,22 +101,28 @@ def write_flight(
 ) -> None:
     """Write the film of the way through a scene (`film.mp4`), and a still at each panorama before it (`01_NAME.png`).
 
+    Around a scene without cameras, the film is a turn, with four stills.
+
     Args:
         film: of the scene or tour.
-        scene: the scene, or the first one of the tour.
-        tour: None for another scene.
+        loaded: the scene, or the first one of the tour.
+        scenes: those of the tour; None for another scene.
         folder: created if it does not exist.
         fps, seconds: see `list_flight`.
         show_file: called with each file that is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if tour is None and not len(scene.cam2world):
-        shots = orbit_scene(scene, fps, seconds)
+    if scenes is None and loaded.facts is None:
+        shots = orbit_scene(loaded.scene, fps, seconds)
         visits, names = {k: k / _ORBIT_STILLS for k in range(_ORBIT_STILLS)}, ["view"] * _ORBIT_STILLS
     else:
-        route = plan_visits(scene) if tour is None else plan_route(tour, plan_walk(tour), rest=REST_SECONDS)
+        if scenes is None:
+            tour, route = loaded.facts.tour, plan_visits(loaded.facts)
+        else:  # in its graph, walls and poor edges are known
+            tour = scenes.tour
+            route = plan_route(tour, plan_walk(tour), rest=REST_SECONDS, outlooks=scenes.outlooks)
         shots, visits = list_flight(route, fps, FIELD_OF_VIEW, seconds), route.visits
-        names = [panorama.label for panorama in (tour or make_graph(scene)).panoramas]
+        names = [panorama.label for panorama in tour.panoramas]
     stills: dict[int, list[str]] = {}
     for node, at in visits.items():
         still = f"{node + 1:02d}_{make_file_name(names[node])}.png"

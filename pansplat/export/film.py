@@ -141,11 +141,10 @@ class Shot:
         return Shot(moment.pose, fov, seconds, moment, goal)
 
 
-def plan_visits(scene: Scene) -> Route:
+def plan_visits(facts: TourFacts) -> Route:
     """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
-    facts = TourFacts(scene)
     outlooks = dict(enumerate(facts.outlooks))
-    if scene.tour is not None:
+    if facts.scene.tour is not None:
         return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=outlooks)
     tour = facts.tour.with_all_edges()
     return plan_route(tour, range(len(tour)), rest=REST_SECONDS, outlooks=outlooks)

@@ -70,7 +70,11 @@ class TourFacts:
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
         _ = self.outlines, self.outlooks, self.clearances, self.hidden, self.walls, self.poor
-        vars(self).pop("surfaces", None)  # much memory
+        return self.forget_surfaces()
+
+    def forget_surfaces(self) -> TourFacts:
+        """Take the surfaces, which need much memory, out of it; they are found again when they are read."""
+        vars(self).pop("surfaces", None)
         return self
 
     @cached_property

@@ -16,6 +16,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.rendering.image_planes import image_planes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
+from pansplat.tours.facts import TourFacts
 
 POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 POSES[1, :3, :3] = torch.tensor(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # looks to the right
@@ -116,7 +117,7 @@ def test_each_frame_of_a_film_shows_the_path_at_its_time(scene: Scene, tmp_path:
 
 
 def test_a_film_of_two_panoramas_moves_as_that_of_a_tour(scene: Scene) -> None:
-    route = plan_visits(scene)
+    route = plan_visits(TourFacts(scene))
     kinds = [step.kind for step in route.steps]
     assert kinds == ["rest", "flight", "rest"] and route.walk == (0, 1)
     shots = list_flight(route, 24.0, 75.0)

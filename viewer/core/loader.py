@@ -100,7 +100,8 @@ def find_entries(
     """
     if not path.exists():
         raise InputError(
-            f"{path}: no such file or folder; give a panorama, a folder of panoramas, a folder of such folders or a scene file"
+            f"{path}: no such file or folder; give a panorama, a folder of panoramas, a folder of such folders or a "
+            "scene file"
         )
     if path.is_file() and is_scene_file(path):
         return [SceneEntry(path.stem, file=path)]
@@ -199,9 +200,11 @@ def _with_facts(entry: SceneEntry, scene: "Scene", is_final: bool = True) -> Loa
     """A scene without a graph, and where surfaces stop its camera."""
     from pansplat.tours.facts import TourFacts
 
-    facts = TourFacts(scene) if len(scene.cam2world) else None
-    _ = facts and (facts.bounds, facts.usual_heights, facts.hidden)  # computed in this thread
-    return LoadedScene(entry, scene, is_final, facts)
+    if not len(scene.cam2world):
+        return LoadedScene(entry, scene, is_final)
+    facts = TourFacts(scene)
+    _ = facts.bounds, facts.usual_heights, facts.hidden, facts.outlooks  # computed in this thread
+    return LoadedScene(entry, scene, is_final, facts.forget_surfaces())
 
 
 def _load_tour_scene(

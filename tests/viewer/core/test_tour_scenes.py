@@ -15,7 +15,7 @@ from pansplat.export.film import Film, Shot
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.route import FADE_SECONDS, REST_SECONDS, plan_route
 from pansplat.tours.walks import plan_walk
-from pansplat_viewer import run
+from pansplat_viewer import capture, run
 from pansplat_viewer.capture import open_film, write_flight
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.hotspots import find_hotspots
@@ -100,6 +100,20 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
         scenes.add(loaded)
     assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
     assert scenes.plan_way(camera, (1,)).steps[0].kind == "zoom"
+
+
+def test_the_film_of_a_tour_zooms_along_an_edge_that_its_first_scene_shows_to_be_poor(
+    house, load_house, tmp_path, monkeypatch
+):
+    pair = house.make_set((0, 1))
+    loaded = load_house(SceneEntry(house.name, tour=house, pair=pair, views=(0, 1), start=1, max_views=64))
+    vars(loaded.facts).update(poor=[(0, 1)])
+    shots = []
+    monkeypatch.setattr(capture, "write_film", lambda path, film, frames, fps, show: shots.extend(frames))
+    write_flight(None, loaded, TourScenes.start(loaded), tmp_path, 12, None, lambda file: None)
+    steps = {shot.moment.step for shot in shots}
+    assert {step.kind for step in steps if set(step.nodes) == {0, 1}} >= {"zoom"}
+    assert "flight" not in {step.kind for step in steps if set(step.nodes) == {0, 1}}
 
 
 def test_a_zoom_shows_both_photographs_and_ends_in_that_of_its_goal(parted_house):
@@ -290,7 +304,7 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scene
         complete.append((tmp_path / "film.mp4").exists())
 
     film = open_tour_film(scenes, load)
-    write_flight(film, scenes.get((0, 1)).scene, house, tmp_path, 12, None, show_file)
+    write_flight(film, scenes.get((0, 1)), scenes, tmp_path, 12, None, show_file)
     names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
     assert written == [*names, "film.mp4"] and complete == [False] * 4 + [True]
     frames = read_film(tmp_path / "film.mp4")
