@@ -66,9 +66,8 @@ class Session:
         self.current = -1
         self.path: Path | None = None
         self._wanted: tuple[Path, str | None] = Path(), None  # path, and the entry to show of those found there
-        self._kept: tuple[list[SceneEntry], int, Path | None] | None = (
-            None  # what `entries`, `current` and `path` were for the scene that is shown
-        )
+        # What `entries`, `current` and `path` were for the scene that is shown.
+        self._kept: tuple[list[SceneEntry], int, Path | None] | None = None
         self.loaded: LoadedScene | None = None
         self._waiting: LoadedScene | None = None  # it is shown once it is converted for the renderer
         self.tour: TourScenes | None = None

@@ -56,7 +56,7 @@ class Viewer:
 
     Attributes:
         state: the values that a user can change.
-        scenes: those to choose from, which one is shown, and which one comes next.
+        session: the scenes to choose from, which one is shown, and which one comes next.
         stage: draws the image.
         placing: the panoramas whose poses a user changes; None without any.
         hotspots: places of panoramas in the image.

@@ -32,6 +32,7 @@ from torch.nn import functional
 from pansplat import pipeline
 from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
+from pansplat.images.cube_images import DENSE_FACE
 from pansplat.images.image_files import read_face_size
 from pansplat.images.masks import mask_holes
 from pansplat.inputs.content import hash_pixels
@@ -46,7 +47,6 @@ from pansplat.tours.scene_views import choose_scene_views
 
 MIN_HEIGHT = 1024  # least rows of a photograph in a page, unless the file has fewer
 MAX_HEIGHT = 4096  # most rows of a photograph in a folder
-_FACE = 2 / math.pi  # largest size of a face over the height of the photograph: its centre has as many pixels
 _STEP = 16  # the size of a face is a multiple of it, pixels
 _LABEL = 40  # letters of the name of a panorama in names of files
 _PREVIEW, _MIDDLE = 384, 1344  # sizes of the faces of smaller levels, pixels
@@ -155,7 +155,7 @@ def pack_photographs(
         else:
             return packed
         if can_shrink:  # bytes grow by less than the number of pixels
-            shown = min(rows, round(max(sizes) / _FACE))
+            shown = min(rows, round(max(sizes) / DENSE_FACE))
             rows = max(round(shown * min(math.sqrt(num_bytes / expected), _SHRINK)), MIN_HEIGHT)
         else:
             qualities.pop(0)
@@ -175,7 +175,7 @@ def _open_tiles(
         return found[0], found[1], tuple(tile.tobytes() for tile in found[2])
     image, shown = load_photograph(photograph, rows)
     image = _cover_hidden(scene, view, image, shown)
-    levels, tiles = _pack(image, min(_FACE * image.shape[1], most), quality)
+    levels, tiles = _pack(image, min(DENSE_FACE * image.shape[1], most), quality)
     if shown.min() >= 1:
         store.write("tiles", key, (image.shape[1], levels, [np.frombuffer(tile, np.uint8) for tile in tiles]))
     return image.shape[1], levels, tiles

@@ -42,7 +42,7 @@ MAX_SIZE = 8000  # pixels along a face; OpenCV resamples at most 32,767 rows
 _MIN_HEIGHT = 4  # rows of a panorama from which on every face has rows and columns
 _FRAME = 2  # pixels around a face that the cubic filter takes from the neighbouring faces
 _SAMPLES = 2  # samples per pixel and axis; faces are up to twice as dense at their edges as a panorama
-_DENSE_FACE = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
+DENSE_FACE = 2 / math.pi  # face size over panorama height at which the centre of a face is as dense as the panorama
 _CAP = 0.6  # radians; beyond it a column may meet the upper or lower face; the cube's corners are at 0.615
 
 
@@ -113,7 +113,7 @@ class CubeImage:
 
     def read(self, height: int, decode: Decode) -> tuple[UInt8[Array, "height width 3"], None]:
         """The equirectangular panorama at (height, 2 height); None, as the pictures show all of it."""
-        level = next((level for level in self.levels if level.size >= _DENSE_FACE * height), self.levels[-1])
+        level = next((level for level in self.levels if level.size >= DENSE_FACE * height), self.levels[-1])
         return equirect_from_faces(level.read(self.folder, decode), height), None
 
 

@@ -5,12 +5,14 @@ Images are RGB in [0, 1] with the sRGB curve, as in JPG and PNG. EXR files hold 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import logging
 import math
 import struct
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -36,7 +38,7 @@ from pansplat.images.blur_masks import (
     resize_hidden,
     widen_hidden,
 )
-from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
+from pansplat.images.cube_images import CUBE_SUFFIX, DENSE_FACE, CubeImage
 from pansplat.images.panorama_metadata import SOFTWARE_XMP, find_stated_problem, find_xmp, make_gpano_xmp
 from pansplat.images.rig_images import RIG_SUFFIX, RigImage
 from pansplat.system.atomic import replacing
@@ -130,7 +132,7 @@ def read_face_size(path: Path | str) -> int:
     pixels for an angle in its middle as the panorama, width / pi. No pixels are decoded."""
     path = Path(path)
     cube = _read_assembled(path) if is_assembled(path) else None
-    return cube.levels[-1].size if isinstance(cube, CubeImage) else int(2 * read_height(path) / math.pi)
+    return cube.levels[-1].size if isinstance(cube, CubeImage) else int(DENSE_FACE * read_height(path))
 
 
 def read_size(path: Path | str) -> tuple[int, int]:
@@ -158,7 +160,8 @@ def _read_shape(path: Path) -> tuple[int, int, str | None]:
         with open(path, "rb") as file:
             head = file.read(len(_EXR_MAGIC))
         if head.startswith(_EXR_MAGIC):
-            (left, top), (right, bottom) = np.array(_read_exr(path, header_only=True)).tolist()
+            with _open_exr(path, header_only=True) as file:
+                (left, top), (right, bottom) = np.array(file.header()["dataWindow"]).tolist()
             return right - left + 1, bottom - top + 1, None
         with Image.open(path, formats=_PILLOW_FORMATS) as image:
             size = image.size
@@ -612,15 +615,20 @@ def _decode_deep(path: Path, data: bytes) -> _DecodedImage:
     return _DecodedImage(color, np.ascontiguousarray(values[..., 3]) if values.shape[2] == 4 else None)
 
 
-def _read_exr(path: Path, *, header_only: bool = False) -> Any:
-    """The channels of an EXR by name, or the corners of its data window."""
+def _read_exr(path: Path) -> dict[str, NDArray[Any]]:
+    """The channels of an EXR by name."""
+    with _open_exr(path) as file:
+        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+
+
+@contextlib.contextmanager
+def _open_exr(path: Path, *, header_only: bool = False) -> Iterator[Any]:
+    """An open file of OpenEXR; the block reads it."""
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), header_only=header_only) as file:
-            if header_only:
-                return file.header()["dataWindow"]
-            return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+            yield file
     except Exception as error:  # OpenEXR has no base class of its errors
         raise InputError(
             f"{path}: needed a complete EXR image, got damaged or truncated data ({error}); export it again."

@@ -155,12 +155,12 @@ def _find_junction(
     """
     between = []
     for (i, j), relation in relations.items():
+        is_forward = i in first and j in second
+        if not is_forward and not (j in first and i in second):
+            continue
         likely = relation.hypotheses.log_odds > _LEAST_ODDS
         motions, odds = relation.hypotheses.motions[likely], relation.hypotheses.log_odds[likely]
-        if i in first and j in second:
-            between.append((i, j, motions, odds))
-        elif j in first and i in second:
-            between.append((j, i, np.linalg.inv(motions), odds))
+        between.append((i, j, motions, odds) if is_forward else (j, i, np.linalg.inv(motions), odds))
     stated = [first[i] @ np.linalg.inv(motions) @ np.linalg.inv(second[j]) for i, j, motions, _ in between]
     found = np.concatenate((np.empty((0, 4, 4)), *stated))
     if not len(found):

@@ -592,18 +592,17 @@ def estimate_relative_pose(
         indices[:0],
         score=best.score,
         places=places,
-        uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)),
         distance=best.distance,
         log_odds=log_odds,
         problem=None if log_odds >= _PROBABLE_ODDS else _describe_doubt(places, log_odds),
         hypotheses=Hypotheses(np.stack([h.motion for h in compared]), odds),
     )
     if best.is_proposed:
-        return relation
+        return replace(relation, uncertainty=(_PROPOSAL_NOISE[0], math.atan(_PROPOSAL_NOISE[1] / best.distance)))
     right = best.probability > 0.5
     parallax = angle_between(a @ best.rotation.T, b)[right]
     spread = float(np.quantile(parallax, 0.9)) if len(parallax) else 0.0
-    relation = replace(relation, indices=indices[right], parallax=spread, uncertainty=(math.inf, math.inf))
+    relation = replace(relation, indices=indices[right], parallax=spread)
     if spread < _MIN_PARALLAX * np.median(evidence.noise) and right.sum() >= _MIN_MATCHES:
         problem = f"both were taken at one place: parallax of {math.degrees(spread):.2f} degrees"
         return replace(relation, problem=problem, hypotheses=Hypotheses())

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from numba.core import types as types
-from numba.core.cgutils import alloca_once as alloca_once
 from numba.core.cgutils import get_or_insert_function as get_or_insert_function
 from numba.core.event import Listener, install_listener
 from numba.core.typing.templates import ConcreteTemplate as ConcreteTemplate
@@ -37,18 +36,24 @@ def share_literal_versions(compiled: Any) -> None:
     )
 
 
+class _Notifier(Listener):
+    """Calls a function with the name of the module of what is compiled."""
+
+    def __init__(self, notify: Callable[[str], None]) -> None:
+        self._notify = notify
+
+    def on_start(self, event: Any) -> None:
+        self._notify(event.data["dispatcher"].py_func.__module__)
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
 @contextlib.contextmanager
 def notify_of_compilation(notify: Callable[[str], None]) -> Iterator[None]:
     """Within the block, call `notify` with the name of a function's module when its compilation begins."""
 
-    class Notifier(Listener):
-        def on_start(self, event: Any) -> None:
-            notify(event.data["dispatcher"].py_func.__module__)
-
-        def on_end(self, event: Any) -> None:
-            pass
-
-    with install_listener("numba:compile", Notifier()):
+    with install_listener("numba:compile", _Notifier(notify)):
         yield
 
 

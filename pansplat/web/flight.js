@@ -15,7 +15,7 @@ const MAX_STILL = 8e6; // pixels of the image of a still, whose memory it limits
 const NEAR = HEADER.speed; // metres: a second's walk
 export const PHOTO_WAIT_MS = 2000; // longest wait for a photograph: at the end of a zoom, and before the first Gaussians are loaded
 
-export function jump(position, { yaw, pitch }, isZoom = false) {
+function jump(position, { yaw, pitch }, isZoom = false) {
   takeStill(isZoom);
   place({ position: [...position], yaw, pitch });
 }

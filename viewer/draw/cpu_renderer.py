@@ -170,9 +170,9 @@ class CpuRenderer:
             raise InputError(
                 f"the image needs {largest} pixels a side, the limit is {LARGEST_SIDE}; use a smaller size"
             )
-        groups = self._choose_groups(frame)
         if frame.has_faces:
-            return self._show(self._read_from_faces(frame, groups))
+            return self._show(self._read_from_faces(frame))
+        groups = self._choose_groups(frame)
         key = (frame.rotation.tobytes(), frame.world_position.tobytes(), frame.full_size, settings)
         if self._pending != key:
             self._stop()
@@ -308,7 +308,7 @@ class CpuRenderer:
             self._colored = name, scene.with_colors(color_by_label(getattr(splats, name)))
         return self._colored[1]
 
-    def _read_from_faces(self, frame: Frame, groups: _Groups) -> _Picture:
+    def _read_from_faces(self, frame: Frame) -> _Picture:
         """Read the image from the cube faces of the position; draws those that are missing."""
         start = time.perf_counter()
         stored = self._find_face_set(frame)

@@ -127,7 +127,7 @@ def accumulate_direction_gradients(rows, direction_row, num, view_dependent, gra
 
 
 @inline_kernel
-def evaluate_colors(harmonics, start, count, basis, view_dependent, rows, radius_row, values):
+def evaluate_colors(harmonics, start, count, basis, rows, radius_row, values):
     """Write the colour max(0, 0.5 + sum_k Y_k c_k) and the radius of `count` Gaussians from `start` on into values."""
     zero = np.float32(0)
     for i in range(count):

@@ -150,7 +150,7 @@ def _project_gaussians(
         for i in range(count):
             store_scalar(kept, start + i, block_kept[i])
         evaluate_basis(rows, DIRECTION_ROW, harmonics.shape[1], view_dependent, basis)
-        evaluate_colors(harmonics, start, count, basis, view_dependent, rows, RADIUS_ROW, values)
+        evaluate_colors(harmonics, start, count, basis, rows, RADIUS_ROW, values)
 
 
 @inline_kernel

@@ -42,7 +42,6 @@ _FOUR_FLOATS = ir.VectorType(_FLOAT, 4)
 _ELEMENT = object()  # stands for the type of an array's elements
 _VECTOR_TYPES = {"f32x8": _FLOATS, "f64x8": _DOUBLES, "mask": _BITS}
 _ALIGNMENT = {_FLOATS: 4, _FOUR_FLOATS: 4, _DOUBLES: 8, _BYTES: 1}  # bytes; alignment of each type's elements
-_CACHE_LINE = 64  # bytes
 _F64_FLAGS = ("contract", "nsz")  # the options of fastmath in system/kernels.py
 
 # 2^x on [-1/2, 1/2]: least maximum relative error (9.2e-8) among polynomials of degree 5 that are 1 at 0.
