@@ -402,7 +402,7 @@ class Session:
             return self.tour.find_place(position)
         if state.graph is None or facts is None:
             return None
-        node = int(np.linalg.norm(state.graph.positions - position, axis=1).argmin())
+        node = state.graph.find_nearest(position)
         return PlaceFacts(node, facts.usual_heights[node], facts.hidden[node])
 
     def _plan_way(self, nodes: Sequence[int], rest: float = 0.0) -> Route:

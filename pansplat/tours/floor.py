@@ -153,7 +153,7 @@ def find_storeys(heights: Float[np.ndarray, "n"]) -> list[list[int]]:
 
 def find_other_storeys(tour: TourGraph, position: Float[np.ndarray, "3"]) -> frozenset[int]:
     """The panoramas of the world around a position in other storeys than the one that is nearest in height."""
-    nearest = int(np.linalg.norm(tour.positions - position, axis=1).argmin())
+    nearest = tour.find_nearest(position)
     members = np.flatnonzero(np.array(tour.worlds) == tour.worlds[nearest])
     storeys = np.array(assign_storeys(tour))[members]
     rises = (tour.positions[members] - position) @ tour.level_axes[:, 1]

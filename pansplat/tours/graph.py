@@ -160,6 +160,11 @@ class TourGraph:
         """The edge of a node with the largest overlap."""
         return max((edge for edge in self.overlaps if node in edge), key=self.overlaps.__getitem__)
 
+    def find_nearest(self, position: Float[np.ndarray, "3"], nodes: Sequence[int] | None = None) -> int:
+        """The node of some nodes, by default of all, that is nearest to a position, metres."""
+        nodes = range(len(self)) if nodes is None else nodes
+        return nodes[int(np.linalg.norm(self.positions[list(nodes)] - position, axis=1).argmin())]
+
     def length(self, edge: Edge) -> float:
         """Distance between the cameras of an edge, metres."""
         a, b = self.positions[list(edge)]

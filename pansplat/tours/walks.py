@@ -49,7 +49,7 @@ def find_way(tour: TourGraph, position: Float[np.ndarray, "3"], node: int, part:
 
     ends: Sequence[int] = nearest
     if nearest in tour.poor:  # no camera flies to its other end
-        ends = [min(nearest, key=lambda end: float(np.linalg.norm(tour.positions[end] - position)))]
+        ends = [tour.find_nearest(position, nearest)]
     return min((find_walk(tour, end, node) for end in ends), key=measure)
 
 

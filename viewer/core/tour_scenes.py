@@ -247,7 +247,7 @@ class TourScenes:
 
     def find_nearest(self, position: Float[np.ndarray, "3"]) -> int:
         """The end of the edge that is nearer to a position: another panorama may be behind a wall."""
-        return min(self.edge, key=lambda node: float(np.linalg.norm(self.tour.positions[node] - position)))
+        return self.tour.find_nearest(position, self.edge)
 
     def is_inside(self, position: Float[np.ndarray, "3"], views: ViewNumbers) -> bool:
         """Whether the scene of some panoramas is good at a position: they are of its edge, or one of them is there."""
@@ -342,7 +342,7 @@ def plan_way(
             walk += find_walk(graph, a, b)[1:]
     else:
         edge, _ = graph.find_nearest_edge(position, part)
-        walk = plan_walk(graph, min(edge, key=lambda node: float(np.linalg.norm(graph.positions[node] - position))))
+        walk = plan_walk(graph, graph.find_nearest(position, edge))
     return plan_route(graph, walk, camera, rest=rest, outlooks=outlooks)
 
 

@@ -148,7 +148,7 @@ class Minimap:
                 canvas.add_rect_filled((x - half, y - half), (x + half, y + half), color)
             else:
                 canvas.add_circle_filled((x, y), 4.0 * scale, color)
-        here = int(np.linalg.norm(tour.positions - np.asarray(camera.position), axis=1).argmin())
+        here = tour.find_nearest(np.asarray(camera.position))
         points = (np.asarray(camera.position) + ahead * camera.rotation[:, 2] for ahead in (0, 1))
         place, ahead = (self._move(here, point @ axes) for point in points)
         heading = (ahead - place) / max(float(np.linalg.norm(ahead - place)), 1e-6)
