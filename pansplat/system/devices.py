@@ -34,7 +34,7 @@ _current: ContextVar[tuple[Device, _Say | None]] = ContextVar("device", default=
 def measure_free_memory() -> float:
     """Bytes of main memory that programs can use without swapping; infinite where the system does not state it."""
     with contextlib.suppress(OSError, AttributeError):
-        found = re.search(r"MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text())
+        found = re.search(r"MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text(encoding="utf-8"))
         return 1024.0 * int(found[1]) if found else math.inf
     return math.inf
 
