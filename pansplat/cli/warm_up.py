@@ -17,13 +17,11 @@ from pansplat.pipeline import predict
 from pansplat.rendering.cpu.display import DisplayScene, PixelFaces, Selection, blend_to_pixels
 from pansplat.rendering.cpu.tiling import radix_argsort
 from pansplat.rendering.rasterize import rasterize
-from pansplat.system.kernels import hide_message
 
 
 def main() -> None:
     """Predict, refine and draw a small scene of noise, and print the time."""
     start = time.perf_counter()
-    hide_message()
     images, masks = torch.rand(2, 3, 64, 128), torch.ones(2, 64, 128, dtype=torch.bool)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
