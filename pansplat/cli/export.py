@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Computation, Out, ScenePrediction, list_panoramas
+from pansplat.cli.inputs import Computation, Out, ScenePrediction
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count, list_first
@@ -226,7 +226,7 @@ class _TrainingSet:
             gaussians = gaussians.select(chosen.sort().values)
         views = [
             dataclasses.replace(panorama, cam2world=pose)
-            for panorama, pose in zip(list_panoramas(source), scene.frame.globalize(scene.cam2world), strict=True)
+            for panorama, pose in zip(source.panoramas, scene.frame.globalize(scene.cam2world), strict=True)
         ]
         means = scene.frame.globalize_places(gaussians.means).cpu().numpy()
         colors = make_colors(gaussians).cpu().numpy()

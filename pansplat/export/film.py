@@ -74,10 +74,9 @@ class FilmPhotographs:
     @staticmethod
     def open(source: PanoramaSet | TourGraph, scene: Scene) -> FilmPhotographs:
         """The photographs that a scene, or all scenes of a tour, are predicted from."""
-        panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
-        poses = torch.stack([panorama.cam2world for panorama in panoramas])
-        gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
-        return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
+        poses = torch.stack([panorama.cam2world for panorama in source.panoramas])
+        gains = scene.gains if scene.joint and len(scene.cam2world) == len(poses) else ()
+        return FilmPhotographs(list_photographs(source, range(len(poses))), poses, gains)
 
     def find_stop(self, pose: Pose) -> tuple[int | None, float]:
         """The photograph at whose panorama a camera is, and its weight, which falls beyond `STOP_REACH`."""
