@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -31,6 +31,9 @@ from pansplat.sweep.surface import (
     upright_rotation,
 )
 from pansplat.system.kernels import cached_njit, parallel_for, thread_count
+
+if TYPE_CHECKING:
+    from pansplat.sweep.guided_sweep import NetworkPrior
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
 _MAX_VARIANCE = 4e-3  # largest variance of grey values that raises a weight; more texture has no more
@@ -72,40 +75,6 @@ class DepthPrior:
         return DepthPrior(rotated[..., 0], rotated[..., 1])
 
 
-class ObservedViews(Protocol):
-    """The model's view of upright panoramas.
-
-    Attributes:
-        priors: the estimate of each panorama by itself, in units of its camera's height.
-    """
-
-    priors: list[DepthPrior]
-
-    def sharpen(self) -> list[np.ndarray]:
-        """Log-depth (h, w) of each panorama by itself, larger than the priors, with the edges of the photograph."""
-        ...
-
-    def refine(
-        self,
-        estimates: Sequence[DepthPrior],
-        cam2world: np.ndarray,
-        neighbours: Sequence[Sequence[int]],
-        iterations: int,
-    ) -> list[DepthPrior]:
-        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of each view with its neighbours."""
-        ...
-
-
-class PriorModel(Protocol):
-    """Estimates depth. `fingerprint` changes whenever the estimates could."""
-
-    fingerprint: str
-
-    def observe(self, images: Sequence[np.ndarray]) -> ObservedViews:
-        """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
-        ...
-
-
 class PriorEstimator:
     """Estimates the priors of each view, in the unit of the poses.
 
@@ -119,7 +88,7 @@ class PriorEstimator:
 
     def __init__(
         self,
-        model: PriorModel,
+        model: NetworkPrior,
         images: Sequence[np.ndarray],
         cam2world: np.ndarray,
         down: np.ndarray,

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -36,7 +37,7 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.prior import DepthPrior, PriorEstimator, PriorModel, apply_prior_cost
+from pansplat.sweep.prior import DepthPrior, PriorEstimator, apply_prior_cost
 from pansplat.sweep.surface import (
     PosedImages,
     Surface,
@@ -49,6 +50,9 @@ from pansplat.sweep.surface import (
 )
 from pansplat.sweep.whole import make_whole
 from pansplat.system.progress import report_progress
+
+if TYPE_CHECKING:
+    from pansplat.sweep.guided_sweep import NetworkPrior
 
 _LONE_STEP = 0.6  # metres by which a camera leaves a view that has no neighbours
 _SMALL_HEIGHT = 96  # rows of the panoramas with which heights of the cameras over the floor are compared
@@ -99,7 +103,7 @@ class ObservedScene:
 def observe(
     posed: PosedImages,
     config: SearchConfig,
-    prior_model: PriorModel | None = None,
+    prior_model: NetworkPrior | None = None,
 ) -> ObservedScene:
     """The depth range, neighbours, axes and priors of panoramas (v, h, 2h, 3)."""
     report_progress("finding the scene's axes", 0.0)

@@ -93,7 +93,7 @@ class Trainer:
         self.average = ExponentialMovingAverage(self.network, config.optimizer.ema) if config.optimizer.ema else None
         perceptual = choose_perceptual(config.perceptual, device=self.device)
         self._training_step = TrainingStep(self.network, self.auxiliary, perceptual, config.loss, config.memory)
-        self.perceptual_name = getattr(perceptual, "name", "none")
+        self.perceptual_name = perceptual.name
         self.step = 0
         latest = load_latest(self.folder, self._restore)
         self.resumed_from = None if latest is None else latest[0]
