@@ -31,7 +31,7 @@ from pansplat.sweep.surface import (
     FREE_SPACE,
     PosedImages,
     Surface,
-    classify_point,
+    classify_visibility,
     consistency_mask,
     for_point_ranges,
     guided_upsample,
@@ -300,31 +300,20 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
     A point in the consistent free space of more views than confirm it is not kept.
     """
     posed = scene.posed
-    # Rows of `counts`: views that confirm the point, that contradict it, that may, and that are too near to it.
-    counts = np.zeros((4, len(points)), np.int16)
+    confirmed, contradicted, doubtful, near = np.zeros((4, len(points)), np.int16)
     for other in scene.neighbours[view]:
         certain = scene.consistent[other] & posed.masks[other]
-        pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
-        inverse = scene.surfaces[other].inverse_depth
-        limits = _DEPTH_TOLERANCE, _MIN_DISTANCE * posed.near
-        for_point_ranges(partial(_count_judgements, points, inverse, certain, pose, *limits, counts), len(points))
-    confirmed, contradicted, doubtful, near = counts
+        classes, distances, pixel = classify_visibility(
+            points, scene.surfaces[other], posed.cam2world[other], _DEPTH_TOLERANCE
+        )
+        is_free = classes == FREE_SPACE
+        confirmed += classes == CONSISTENT
+        contradicted += is_free & certain[pixel]
+        doubtful += is_free & ~certain[pixel]
+        near += distances <= _MIN_DISTANCE * posed.near
     opacity = np.where(doubtful > 0, np.float32(_UNCERTAIN_OPACITY), np.float32(_SINGLE_VIEW_OPACITY))
     opacity[confirmed > 0] = _CONSISTENT_OPACITY
     return opacity, (near == 0) & (contradicted <= confirmed)
-
-
-@cached_njit(nogil=True)
-def _count_judgements(points, inverse_depth, certain, cam2world, tolerance, nearest, counts, first, end):
-    """Add what a view says about each point to `counts`; see `_estimate_opacity`."""
-    for n in range(first, end):
-        kind, distance, row, column = classify_point(points[n], inverse_depth, cam2world, tolerance)
-        if kind == CONSISTENT:
-            counts[0, n] += 1
-        elif kind == FREE_SPACE:
-            counts[1 if certain[row, column] else 2, n] += 1
-        if distance <= nearest:
-            counts[3, n] += 1
 
 
 def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:

@@ -158,32 +158,35 @@ class PosedImages:
         return float(measure_distances(self.cam2world[list(views)]).max())
 
 
-def classify_visibility(points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float) -> np.ndarray:
-    """Class (uint8) of world points (..., 3): CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE."""
+def classify_visibility(
+    points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Classes (uint8) of world points (..., 3), distances from the camera, and rows and columns of their pixels.
+
+    A point is CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE.
+    """
     flat = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-    classes, pose = np.empty(len(flat), np.uint8), np.ascontiguousarray(cam2world)
-    for_point_ranges(partial(_classify_points, flat, surface.inverse_depth, pose, tolerance, classes), len(flat))
-    return classes.reshape(points.shape[:-1])
-
-
-@nb.njit(inline="always")
-def classify_point(point, inverse_depth, cam2world, tolerance):
-    """Class of a world point for one view, its distance from the camera, and the row and column of its pixel."""
-    x, y, z = point[0] - cam2world[0, 3], point[1] - cam2world[1, 3], point[2] - cam2world[2, 3]
-    right = x * cam2world[0, 0] + y * cam2world[1, 0] + z * cam2world[2, 0]
-    down = x * cam2world[0, 1] + y * cam2world[1, 1] + z * cam2world[2, 1]
-    ahead = x * cam2world[0, 2] + y * cam2world[1, 2] + z * cam2world[2, 2]
-    distance = max(math.sqrt(x * x + y * y + z * z), 1e-9)
-    row, column = locate_pixel(right, down, ahead, len(inverse_depth))
-    ratio = 1 / (distance * inverse_depth[row, column])
-    kind = CONSISTENT if ratio > 1 - tolerance else OCCLUDED
-    return FREE_SPACE if ratio > 1 + tolerance else kind, distance, row, column
+    found = np.empty(len(flat), np.uint8), np.empty(len(flat)), np.empty((2, len(flat)), np.int32)
+    pose = np.ascontiguousarray(cam2world, np.float64)
+    for_point_ranges(partial(_classify_points, flat, surface.inverse_depth, pose, tolerance, *found), len(flat))
+    classes, distances, row, column = (each.reshape(points.shape[:-1]) for each in (*found[:2], *found[2]))
+    return classes, distances, (row, column)
 
 
 @cached_njit(nogil=True)
-def _classify_points(points, inverse_depth, cam2world, tolerance, classes, first, end):
+def _classify_points(points, inverse_depth, cam2world, tolerance, classes, distances, pixels, first, end):
     for n in range(first, end):
-        classes[n] = classify_point(points[n], inverse_depth, cam2world, tolerance)[0]
+        point = points[n]
+        x, y, z = point[0] - cam2world[0, 3], point[1] - cam2world[1, 3], point[2] - cam2world[2, 3]
+        right = x * cam2world[0, 0] + y * cam2world[1, 0] + z * cam2world[2, 0]
+        down = x * cam2world[0, 1] + y * cam2world[1, 1] + z * cam2world[2, 1]
+        ahead = x * cam2world[0, 2] + y * cam2world[1, 2] + z * cam2world[2, 2]
+        distance = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        row, column = locate_pixel(right, down, ahead, len(inverse_depth))
+        ratio = 1 / (distance * inverse_depth[row, column])
+        kind = CONSISTENT if ratio > 1 - tolerance else OCCLUDED
+        classes[n] = FREE_SPACE if ratio > 1 + tolerance else kind
+        distances[n], pixels[0, n], pixels[1, n] = distance, row, column
 
 
 def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
@@ -210,7 +213,8 @@ def consistency_mask(
     points = world_points(surfaces[view], cam2world[view])
     consistent = np.zeros(points.shape[:2], bool)
     for other in others:
-        consistent |= classify_visibility(points, surfaces[other], cam2world[other], _MAX_INCONSISTENCY) == CONSISTENT
+        classes, _, _ = classify_visibility(points, surfaces[other], cam2world[other], _MAX_INCONSISTENCY)
+        consistent |= classes == CONSISTENT
     return consistent
 
 
