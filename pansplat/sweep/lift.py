@@ -24,7 +24,7 @@ import torch
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.equirect import row_weights, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
 from pansplat.sweep.surface import (
     CONSISTENT,
@@ -35,7 +35,6 @@ from pansplat.sweep.surface import (
     consistency_mask,
     for_point_ranges,
     guided_upsample,
-    locate,
     locate_pixel,
     nearest_pixel,
     pad_sphere,
@@ -214,14 +213,13 @@ def _lift_lattice(
     quats, scales = np.empty((len(rays), 4), np.float32), np.empty((len(rays), 3), np.float32)
     shape = rays, inverse_depth, gradient, size, steepest, _THICKNESS, pose, quats, scales
     for_point_ranges(partial(_shape_discs, *shape), len(rays))
-    color = np.empty((len(rays), 3), np.float32)
-    for_point_ranges(partial(_sample_bilinear, pad_sphere(image, 1), rays, color), len(rays))
+    color = sample_equirect(torch.from_numpy(image).permute(2, 0, 1), uv_from_directions(torch.from_numpy(rays)))
     return Gaussians(
         means=torch.from_numpy(points).float(),
         scales=torch.from_numpy(scales),
         quats=torch.from_numpy(quats),
         opacities=torch.from_numpy(opacity),
-        harmonics=torch.from_numpy((color - 0.5) / SH_0).float()[:, None, :],
+        harmonics=((color.T - 0.5) / SH_0).contiguous()[:, None],
         levels=torch.full((len(points),), level, dtype=torch.uint8),
         views=torch.full((len(points),), view, dtype=torch.uint8),
     )
@@ -231,20 +229,6 @@ def _locate_lattice(rows: int, height: int) -> _Lattice:
     """The lattice with the spacing of the pixels of `rows` rows, in a panorama of `height` rows."""
     rays = fibonacci_directions(lattice_size(2 * rows)).numpy()
     return rays, nearest_pixel(rays, height)
-
-
-@cached_njit(nogil=True)
-def _sample_bilinear(padded, rays, samples, first, end):
-    """Write bilinear samples (n, c) of a panorama, which is padded by one pixel, along rays (n, 3)."""
-    height = len(padded) - 2
-    for n in range(first, end):
-        x, y = locate(rays[n, 0], rays[n, 1], rays[n, 2], height)
-        column, row = min(int(x + 0.5), 2 * height), min(int(y + 0.5), height)  # pixel of the padded image
-        right, lower = x + 0.5 - column, y + 0.5 - row
-        for c in range(samples.shape[1]):
-            above = padded[row, column, c] * (1 - right) + padded[row, column + 1, c] * right
-            below = padded[row + 1, column, c] * (1 - right) + padded[row + 1, column + 1, c] * right
-            samples[n, c] = above * (1 - lower) + below * lower
 
 
 def _window_extremum(values: np.ndarray, radius: int, *, largest: bool) -> np.ndarray:

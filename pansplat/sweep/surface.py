@@ -33,16 +33,10 @@ def ray_grid(height: int) -> np.ndarray:
 
 
 @nb.njit(inline="always")
-def locate(x, y, z, height):
-    """Continuous x and y of a direction of any length in a panorama; pixel centres at half-integers."""
-    column = (math.atan2(x, z) / (2 * math.pi) + 0.5) * 2 * height
-    return column, (math.atan2(y, math.sqrt(x * x + z * z)) / math.pi + 0.5) * height
-
-
-@nb.njit(inline="always")
 def locate_pixel(x, y, z, height):
     """Row and column of the pixel that holds a direction."""
-    column, row = locate(x, y, z, height)
+    column = (math.atan2(x, z) / (2 * math.pi) + 0.5) * 2 * height
+    row = (math.atan2(y, math.sqrt(x * x + z * z)) / math.pi + 0.5) * height
     return min(int(row), height - 1), int(column) % (2 * height)
 
 
