@@ -20,7 +20,7 @@ import numpy as np
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
+from pansplat.sweep.matching import HypothesisSet, OtherView, View, compute_matching_cost
 from pansplat.sweep.surface import (
     list_best_pairs,
     measure_distances,
@@ -262,7 +262,7 @@ def _match_heights(
     for n, other in enumerate(views):
         if n != index:
             matched = OtherView(other, np.linalg.inv(cam2world[n]) @ cam2world[index], [shape])
-            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), MatchingConfig())
+            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6))
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 

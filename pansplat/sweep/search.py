@@ -30,7 +30,6 @@ from pansplat.sweep.bend import bend_surfaces
 from pansplat.sweep.matching import (
     DepthRange,
     HypothesisSet,
-    MatchingConfig,
     OtherView,
     View,
     aggregate_costs,
@@ -294,7 +293,7 @@ class _SearchLevel:
             OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
             for other in self.neighbours[view]
         ]
-        return compute_matching_cost(self.views[view], others, self.limits, MatchingConfig())
+        return compute_matching_cost(self.views[view], others, self.limits)
 
     def _select_hypotheses(
         self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int
