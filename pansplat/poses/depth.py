@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from pansplat.sweep.surface import rotate_image, upright_rotation
+from pansplat.sweep.panoramas import rotate_image, upright_rotation
 
 _LEAST_DEVIATION = 0.04  # deviation of log-depth at a right match: heights of two cameras differ, too
 _TAIL = 2.0  # degrees of freedom of a right match's deviation

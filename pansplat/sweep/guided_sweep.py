@@ -32,9 +32,9 @@ from pansplat.networks.weights import (
 )
 from pansplat.sweep import Sweep
 from pansplat.sweep.joined_crops import crop_panorama, join_crops
+from pansplat.sweep.panoramas import resize_sphere
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.search import SearchConfig
-from pansplat.sweep.surface import resize_sphere
 from pansplat.system.devices import choose_device
 from pansplat.system.source_hash import hash_sources
 

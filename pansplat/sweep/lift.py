@@ -26,6 +26,14 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import row_weights, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
+from pansplat.sweep.panoramas import (
+    for_point_ranges,
+    locate_pixel,
+    nearest_pixel,
+    pad_sphere,
+    resize_mask,
+    resize_sphere,
+)
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
@@ -33,13 +41,7 @@ from pansplat.sweep.surface import (
     Surface,
     classify_visibility,
     consistency_mask,
-    for_point_ranges,
     guided_upsample,
-    locate_pixel,
-    nearest_pixel,
-    pad_sphere,
-    resize_mask,
-    resize_sphere,
 )
 from pansplat.system.kernels import cached_njit
 

@@ -27,7 +27,7 @@ import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.surface import pad_sphere, ray_grid
+from pansplat.sweep.panoramas import pad_sphere, ray_grid
 from pansplat.system.kernels import cached_njit, fast_atan2, parallel_for, thread_count
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)

@@ -21,15 +21,8 @@ import numpy as np
 from pansplat.geometry.equirect import row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
 from pansplat.sweep.matching import HypothesisSet, OtherView, View, compute_matching_cost
-from pansplat.sweep.surface import (
-    list_best_pairs,
-    measure_distances,
-    nearest_pixel,
-    ray_grid,
-    resize_sphere,
-    rotate_image,
-    upright_rotation,
-)
+from pansplat.sweep.panoramas import nearest_pixel, ray_grid, resize_sphere, rotate_image, upright_rotation
+from pansplat.sweep.surface import list_best_pairs, measure_distances
 from pansplat.system.kernels import cached_njit, parallel_for, thread_count
 
 if TYPE_CHECKING:

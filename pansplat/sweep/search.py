@@ -36,17 +36,9 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
+from pansplat.sweep.panoramas import resize_mask, resize_sharp, resize_sphere
 from pansplat.sweep.prior import DepthPrior, PriorEstimator, apply_prior_cost
-from pansplat.sweep.surface import (
-    PosedImages,
-    Surface,
-    guided_upsample,
-    list_best_pairs,
-    measure_distances,
-    resize_mask,
-    resize_sharp,
-    resize_sphere,
-)
+from pansplat.sweep.surface import PosedImages, Surface, guided_upsample, list_best_pairs, measure_distances
 from pansplat.sweep.whole import make_whole
 from pansplat.system.progress import report_progress
 

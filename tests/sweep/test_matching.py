@@ -16,7 +16,7 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.surface import ray_grid
+from pansplat.sweep.panoramas import ray_grid
 
 _PLAIN = MatchingWeights(textureless_weight=1.0, distance_penalty=0.0)
 _IMPOSSIBLE = 2 * (_PLAIN.correlation_weight + _PLAIN.color_weight)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from pansplat.geometry.equirect import uv_from_directions
+from pansplat.sweep.panoramas import nearest_pixel, ray_grid, resize_sphere
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
@@ -13,9 +14,6 @@ from pansplat.sweep.surface import (
     classify_visibility,
     consistency_mask,
     guided_upsample,
-    nearest_pixel,
-    ray_grid,
-    resize_sphere,
 )
 
 
