@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.path import level_pose, turn_axes, up_direction, wrap_angle
+from pansplat.geometry.level import level_pose, turn_axes, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.poses.axes import SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings, compare

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.path import level_pose
+from pansplat.geometry.level import level_pose
 from pansplat.system.threads import worker_threads
 from pansplat.tours.floor import find_storeys
 

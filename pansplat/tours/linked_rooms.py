@@ -13,7 +13,7 @@ from jaxtyping import Float
 from shapely import Geometry
 from shapely.geometry import Point, Polygon
 
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import RAY_DIRECTIONS, Outline, meet_outline
