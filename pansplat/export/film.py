@@ -143,11 +143,10 @@ class Shot:
 
 def plan_visits(facts: TourFacts) -> Route:
     """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
-    outlooks = dict(enumerate(facts.outlooks))
-    if facts.scene.tour is not None:
-        return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=outlooks)
-    tour = facts.tour.with_all_edges()
-    return plan_route(tour, range(len(tour)), rest=REST_SECONDS, outlooks=outlooks)
+    is_tour = facts.scene.tour is not None
+    tour = facts.graph if is_tour else facts.bounds
+    walk = plan_walk(tour) if is_tour else range(len(tour))
+    return plan_route(tour, walk, rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
 def list_flight(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:

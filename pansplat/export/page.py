@@ -158,7 +158,7 @@ def write_page(
         scene = dataclasses.replace(scene, starts=(), tour=None)
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
     facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
-    tour = dataclasses.replace(facts.tour, poor=facts.poor)
+    tour = facts.graph
     rooms = find_rooms(facts) if has_cameras else None
     scene = prepared
     flights = _plan_flights(tour, len(scene.cam2world))
@@ -395,7 +395,7 @@ def _describe_scene(
             "hasStart": tour.panoramas[view].start is not None,
             "turns": _round(find_turns(facts.outlooks[view])),
             "hidden": facts.hidden[view],
-            "clearances": facts.clearances[view].round(2).tolist(),
+            "clearances": tour.clearances[view].round(2).tolist(),
         }
         for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True))
     ]

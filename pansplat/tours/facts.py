@@ -42,7 +42,7 @@ class TourFacts:
 
     Attributes:
         scene: of some panoramas of the tour, in its world, with all Gaussians of each.
-        tour: the graph.
+        tour: the graph, before its surfaces are known.
         views: the number in the tour of each of the scene's views.
     """
 
@@ -69,7 +69,7 @@ class TourFacts:
 
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
-        _ = self.outlines, self.outlooks, self.clearances, self.hidden, self.walls, self.poor
+        _ = self.outlines, self.outlooks, self.hidden, self.graph
         return self.forget_surfaces()
 
     def forget_surfaces(self) -> TourFacts:
@@ -134,10 +134,16 @@ class TourFacts:
         return np.stack([measure_clearance(own) for own in self.surfaces.values()])
 
     @cached_property
+    def graph(self) -> TourGraph:
+        """The tour with what its surfaces show: walls in place of edges, poor edges, and clearances."""
+        tour, clearances = self.tour.with_walls(self.walls), dict(zip(self.views, self.clearances, strict=True))
+        poor = tuple(edge for edge in self.poor if edge in tour.overlaps)
+        return dataclasses.replace(tour, poor=poor, clearances=clearances)
+
+    @property
     def bounds(self) -> TourGraph:
         """The graph of a scene without edges, whose surfaces stop cameras."""
-        clearances = dict(zip(self.views, self.clearances, strict=True))
-        return dataclasses.replace(self.tour.with_all_edges(), clearances=clearances)
+        return self.graph.with_all_edges()
 
     @_stored
     def hidden(self) -> list[list[int]]:

@@ -561,16 +561,8 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
     def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
         if not entry.views:
             return load_house(replace(entry, views=(0, 1), pair=house.make_set((0, 1)), max_views=64))
-        facts = {
-            "outlines": {},
-            "views": (),
-            "outlooks": (),
-            "clearances": (),
-            "hidden": (),
-            "walls": [],
-            "poor": (),
-        } | found
-        loaded = replace(load_house(entry), facts=SimpleNamespace(**facts))
+        facts = SimpleNamespace(outlines={}, views=(), outlooks=(), hidden=(), graph=replace(house, **found))
+        loaded = replace(load_house(entry), facts=facts)
         if len(entry.views) == 4:
             show(replace(loaded, is_final=False))
             assert go.wait(300)
