@@ -35,8 +35,8 @@ _MIN_PANORAMAS = 3  # least number of panoramas of a tour of one part
 class TourGraph:
     """Panoramas of one place and the edges between them.
 
-    Panoramas that edges connect are a part. Within a part the camera flies; from part to part it zooms. Parts
-    without a common world are side by side (`lay_out`).
+    Panoramas that edges connect are a part. A camera flies along edges, and zooms along poor edges and between parts.
+    Parts without a common world are side by side (`lay_out`).
 
     Attributes:
         name: for lists and folders.

@@ -1,8 +1,8 @@
 """Lists the scenes at a path and loads them in a worker thread.
 
 Pairs go through the prediction pipeline with its cache, scene files are read. Of a tour, the graph and one scene are
-loaded; `tour` requests the predictions of its parts. A file that has the graph of a tour is shown as a tour: its scenes
-are parts of the scene in the file. Imports no torch before it loads.
+loaded; `tour_scenes` requests the predictions of its parts. A file that has the graph of a tour is shown as a tour: its
+scenes are parts of the scene in the file. Imports no torch before it loads.
 """
 
 import time
