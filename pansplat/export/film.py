@@ -210,7 +210,7 @@ class Film:
 
         Args:
             choose: the scene of a frame, and its part of the tour (`choose_scenes`).
-            draw: draws a scene; the number is 0 or 1, and another one for the scene that fades out.
+            draw: draws a scene; the number is slot 0 or 1; the two scenes of a fade have different slots.
             layout: of the frames.
             size: (height, width) of the image of one eye, pixels.
             photographs: that are shown at panoramas.

@@ -122,8 +122,8 @@ class PagePlan(_Record):
 
 
 class PageHouse(_Record):
-    """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas;
-    of tops of walls 2 + the normal of the wall, to the right and forward. `moves`: what the
+    """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas.
+    In triangles of wall tops u and v are 2 + the wall's normal (right, forward). `moves`: what the
     surroundings of each panorama are turned by, radians to the right, and where its camera is then."""
 
     nodes: tuple[int, ...]

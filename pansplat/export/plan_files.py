@@ -1,7 +1,7 @@
 """Floor plans of straight walls as drawings: SVG, and PNG of the same.
 
-The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed, and beside
-them. They are 1:50 on paper.
+The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed
+and stand beside the others. Drawings are 1:50.
 """
 
 from __future__ import annotations

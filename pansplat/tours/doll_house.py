@@ -21,7 +21,7 @@ class Rooms:
 
     Attributes:
         floors, ceilings: their distances below and above the camera of each view, metres.
-        houses: the views of each storey of a world, if at least half of its rooms are on the plan.
+        houses: the views of each storey of a world that has as many closed rooms as views outside of them, or more.
         plan: the floor plan.
     """
 

@@ -157,7 +157,7 @@ class TourFacts:
 
     @_stored
     def walls(self) -> list[Edge]:
-        """The edges that the scene shows to be none (`find_walls`); a scene of `merge_scenes` has no others."""
+        """Edges through walls. Empty if `scene.tour` is known: `merge_scenes` has removed them."""
         return [] if self.scene.tour else find_walls(self.surfaces, self.tour.overlaps)
 
     @_stored

@@ -100,7 +100,10 @@ class TourGraph:
 
     @cached_property
     def worlds(self) -> tuple[int, ...]:
-        """The world of each node: parts with walls between them have known relative places. A pair has no edges."""
+        """The world of each node: parts with walls between them have known relative places.
+
+        Without edges (a scene that is no tour): the worlds of the files.
+        """
         if not self.overlaps:
             return tuple(panorama.world for panorama in self.panoramas)
         return tuple(label_components(len(self), [*self.overlaps, *self.walls]))
@@ -111,7 +114,7 @@ class TourGraph:
 
     @cached_property
     def approximate(self) -> dict[int, tuple[int, ApproximatePlace]]:
-        """The nodes that are not placed, but about a node beside them, and where, as the files of the tour state it."""
+        """For each node that is not placed: the node beside which the files put it, and where."""
         number = {view.image: node for node, view in enumerate(self.panoramas) if view.placement.about is None}
         stated = ((node, view.placement.about) for node, view in enumerate(self.panoramas) if not self.is_placed(node))
         return {node: (number[about.beside], about) for node, about in stated if about and about.beside in number}

@@ -79,8 +79,8 @@ def list_starts(panoramas: Sequence[Panorama]) -> Starts:
 def _join_gains(gains: dict[ViewNumbers, Gains], parts: Sequence[int]) -> Gains:
     """Gains of all panoramas from those of scenes, each of which are relative to the mean of the scene's photographs.
 
-    Panoramas that scenes have in common give the ratios of these means, by least squares. Scenes without gains count
-    with none; without any gains there are none. Those of a part are relative to the mean of the part.
+    Panoramas that scenes have in common give the ratios of these means, by least squares. Scenes without gains are
+    ignored; if none has any, the result is empty. Those of a part are relative to the mean of the part.
 
     Args:
         gains: of each scene's views.

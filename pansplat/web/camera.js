@@ -55,7 +55,7 @@ export const nearestNode = (position) => nearestOf([...parts.keys()].filter((nod
 // Whether the camera is where there are photographs and no Gaussians; it stays at them.
 export const isFixed = () => HEADER.limits[currentPart()] === 0;
 
-// The panorama at the camera, or that from which it looked at the doll's house.
+// The panorama at the camera; in the doll's house, the panorama that the camera left.
 export const nodeHere = () => state.doll.isOn ? state.doll.node : nearestNode(camera.position);
 
 // The panorama within a distance of the camera, metres; null without one, and in the doll's house.

@@ -11,7 +11,8 @@ const isFlown = (from, to) => {
 
 // The rings of a panorama, `{ node, link }`: those of its photograph's links, on the floor where the link meets it or where the
 // other camera stands; those where its flights end, unless a surface hides them; and its own. Of another room only one.
-// Where all flights are hidden, the nearest one stays; where nothing leads on, what leads here, or the nearest panorama.
+// Where all flights are hidden, the nearest one stays. Without any ring: the panoramas whose links lead here; without these, the
+// nearest panorama.
 export function chooseRings(here) {
   const { rooms } = HEADER.plan, { hidden } = HEADER.spots[here];
   const roomOf = (node) => rooms.findIndex((nodes) => nodes.includes(node));
@@ -50,7 +51,8 @@ export function findHeading(from, to) {
 }
 
 // Yaw and pitch at the end of a way with a heading: the start view of the panorama, else the heading, or the widest view where no
-// heading is known. What is no flight comes away from the link back. Without a start view, it turns from a wall that is close.
+// heading is known. After a zoom the camera looks away from the link that leads back. Without a start view, it turns from a wall
+// that is close.
 export function chooseArrival(node, heading, from = null) {
   const { ahead: [yaw, pitch], hasStart, turns } = HEADER.spots[node], back = from !== null && findLink(node, from);
   if (!back && (hasStart || !heading)) return { yaw, pitch };

@@ -1,5 +1,5 @@
-// Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump fades:
-// the image of the camera before covers the new one until that is there, then it fades out; that of a zoom grows.
+// Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump shows a
+// still of the old picture until the new one is ready, then fades it out; in a zoom the still grows.
 
 import { cameraFor, isFixed, nearestNode, nodeHere, nodeWithin, settleAt, turn } from "./camera.js";
 import { chooseArrival, findHeading, headingTo } from "./choices.js";

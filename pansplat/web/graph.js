@@ -1,5 +1,5 @@
 // Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of those of
-// pansplat.tours.graph, walks and limits that they name; tests/web/test_modules.py compares them.
+// pansplat.tours.graph, walks, limits and outlook that they name; tests/web/test_modules.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
 // on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; the `reach` around a part,
@@ -67,7 +67,7 @@ export function limitStep(graph, start, end, part = null) {
   return isStep && measureFree(graph, edge, slid)[0] >= most - 1e-9 ? slid : start;
 }
 
-// measure_free; of all panoramas without an edge
+// _measure_free; without an edge, of all panoramas
 function measureFree(graph, edge, place) {
   const nodes = edge === null ? [...graph.positions.keys()] : graph.edges[edge].slice(0, 2);
   const found = nodes.filter((node) => graph.clearances[node].length).map((node) => {
@@ -81,7 +81,7 @@ function measureFree(graph, edge, place) {
   return [Math.max(free, beside), away];
 }
 
-// find_bin, of a horizon of `count` bins
+// find_bins, of one yaw and a horizon of `count` bins
 export const findBin = (yaw, count) => Math.floor((wrapAngle(yaw) / (2 * Math.PI) + 0.5) * count) % count;
 
 // find_clearance

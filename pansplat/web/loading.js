@@ -52,7 +52,7 @@ export async function fetchFile(name, isAgain) {
   }
 }
 
-// The next file waits for this one, but not for its later tries, which do not end. A page without any Gaussians fails.
+// Files load one by one. A file that fails is tried again for ever, in the background. A page without any Gaussians fails.
 function loadView(view, tries = 1) {
   queue = queue.then(async () => {
     const blob = await fetchFile(...HEADER.views[view].files, tries > 1), chunk = await blob.arrayBuffer();

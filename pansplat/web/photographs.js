@@ -39,8 +39,8 @@ async function readTile({ key, tries }) {
   return image;
 }
 
-// One size of a photograph. `status` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
-// the time of the next one.
+// One size of a photograph. `status` of a tile: null (not requested), "reading", "ready", "failed" (after TRIES tries); `due`: the
+// time of the next try.
 class Level {
   texture = null;
   isFresh = true;
@@ -123,7 +123,8 @@ class Photographs {
     return node === null || this.listMissing(node, size, true).every(({ status }) => status === "failed");
   }
 
-  // The panorama at which the camera stands, as no eye of a headset does; the nearest where there is nothing else to show.
+  // The panorama at which the camera stands; null in a headset, whose eyes are beside it. In a part without Gaussians: the nearest
+  // panorama.
   findNode() {
     return nodeWithin(isFixed() ? Infinity : state.headset.session ? -1 : HEADER.stopReach);
   }

@@ -1,5 +1,5 @@
-// All that changes while the page is shown. Every module but the renderers is functions of it and of HEADER, which is
-// PageHeader of pansplat/export/page_data.py. This module, graph.js, camera.js, choices.js and doll.js need no browser.
+// What several modules change while the page is shown; what one module alone changes is in that module. HEADER is PageHeader of
+// pansplat/export/page_data.py. This module, graph.js, camera.js, choices.js and doll.js need no browser.
 
 import { distanceOf, partOfEdge } from "./graph.js";
 
@@ -57,7 +57,7 @@ export function refresh() {
   state.isDirty = true;
 }
 
-// Draws the next frame, which another one has replaced.
+// Draws again, because `render` has drawn another picture on the canvas.
 export function redraw() {
   state.drawnScale = 0;
   changed();

@@ -274,8 +274,8 @@ class Headset {
 
   // ---- resolution ----
 
-  // Lowers the resolution when frames are late, and raises it after some steady seconds, the more of them the more often that
-  // has made frames late.
+  // Lowers the resolution when frames are late, and raises it after some steady seconds. Each raise that made frames late doubles
+  // the wait before the next.
   adaptScale(elapsed) {
     const { session, scale, times } = this;
     times.push(elapsed);

@@ -51,7 +51,7 @@ class ViewerState:
     is_tour: bool = False  # whether that is the graph of a tour
     route: Route | None = None  # the way through the panoramas; None without cameras
     target: int | None = None  # the panorama to go to; None if there is none
-    has_stopped: bool = False  # whether they have, and a message has said so
+    has_stopped: bool = False  # whether the message that surfaces stop the camera was shown
     plan: bool = True
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
     path_seconds: float = 0.0  # time on the path that the panel shows

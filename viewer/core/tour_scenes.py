@@ -62,7 +62,7 @@ class TourScenes:
         edge: the edge that the camera is at.
         outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
         outlooks: what is seen around panoramas whose scenes have been loaded (`measure_outlook`).
-        hidden: the panoramas whose places on the floor surfaces hide, by those panoramas.
+        hidden: for each panorama, those whose marks it does not see.
     """
 
     def __init__(self, tour: TourGraph, *, merged: Scene | None = None, max_views: int = MAX_SCENE_VIEWS) -> None:
