@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pansplat.export.film import Film, FilmPhotographs, Shot, list_flight, plan_visits, write_film
+from pansplat.export.film import Film, FilmPhotographs, Shot, list_frames, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
 from pansplat.tours.route import NEAR_OF_FAR, REST_SECONDS, plan_route
@@ -108,7 +108,7 @@ def write_flight(
         loaded: the scene, or the first one of the tour.
         scenes: those of the tour; None for another scene.
         folder: created if it does not exist.
-        fps, seconds: see `list_flight`.
+        fps, seconds: see `list_frames`.
         show_file: called with each file that is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -121,7 +121,7 @@ def write_flight(
         else:  # in its graph, walls and poor edges are known
             tour = scenes.tour
             route = plan_route(tour, plan_walk(tour), rest=REST_SECONDS, outlooks=scenes.outlooks)
-        shots, visits = list_flight(route, fps, FIELD_OF_VIEW, seconds), route.visits
+        shots, visits = list_frames(route, fps, FIELD_OF_VIEW, seconds), route.visits
         names = [panorama.label for panorama in tour.panoramas]
     stills: dict[int, list[str]] = {}
     for node, at in visits.items():

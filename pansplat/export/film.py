@@ -149,7 +149,7 @@ def plan_visits(facts: TourFacts) -> Route:
     return plan_route(tour, walk, rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
-def list_flight(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
+def list_frames(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
     """The frames of a way through panoramas, two or more.
 
     Args:

@@ -161,25 +161,25 @@ def write_page(
     tour = facts.graph
     rooms = find_rooms(facts) if has_cameras else None
     scene = prepared
-    flights = _plan_flights(tour, len(scene.cam2world))
+    graph = _plan_graph(tour, len(scene.cam2world))
     house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
     if rooms is not None:
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, rooms, photographs if has_pictures else ())
-    flown = _find_flown_parts(flights, tour.poor) if has_pictures else {*flights.parts}
-    views = [view for view, part in enumerate(flights.parts) if part in flown]
+    flown = _find_flown_parts(graph, tour.poor) if has_pictures else {*graph.parts}
+    views = [view for view, part in enumerate(graph.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))
     scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(is_flown))
-    kept = gaussians * len(views) // len(flights.parts)
+    kept = gaussians * len(views) // len(graph.parts)
     if len(scene.gaussians) > kept:
         report_progress("merging Gaussians", 0.1)
-        scene = _merge(scene, flights.parts, kept, steps=_FIT_STEPS if has_cameras else 0)
+        scene = _merge(scene, graph.parts, kept, steps=_FIT_STEPS if has_cameras else 0)
     report_progress("compressing", 0.6)
     degree = _choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
-    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, flights), degree)
+    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, graph), degree)
     report_progress("drawing the poster", 0.7)
-    first = flights.walk[0]
+    first = graph.walk[0]
     start = scene.cam2world[first].clone()
     start[:3, :3] = torch.from_numpy(turn_axes(tour.level_axes, *_find_ahead(tour, facts, first)))
     poster = _draw_poster(scene, start, photographs if has_pictures else ())
@@ -189,7 +189,7 @@ def write_page(
         with stage(0.95):
             pictures = pack_photographs(prepared, photographs, math.inf if split else left, photo_height)
     report_progress("writing", 0.95)
-    header = _describe_scene(prepared, packed, origin, flights, tour, facts, flown)
+    header = _describe_scene(prepared, packed, origin, graph, tour, facts, flown)
     header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
     header["plan"] = _describe_plan(facts) if has_cameras else _NO_PLAN
     for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
@@ -220,7 +220,7 @@ def choose_gaussians(heights: Sequence[int]) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class _Flights:
+class _PageGraph:
     """How the camera moves.
 
     Attributes:
@@ -236,8 +236,8 @@ class _Flights:
     walk: tuple[int, ...]
 
 
-def _plan_flights(tour: TourGraph, count: int) -> _Flights:
-    """The flights of a tour; without edges, the camera flies from view to view.
+def _plan_graph(tour: TourGraph, count: int) -> _PageGraph:
+    """The graph of a page; without edges, the camera flies from view to view.
 
     Args:
         tour: of the scene.
@@ -245,11 +245,11 @@ def _plan_flights(tour: TourGraph, count: int) -> _Flights:
     """
     if not tour.overlaps:
         views = tuple(range(count))
-        return _Flights((0,) * count, (views,), (), views)
+        return _PageGraph((0,) * count, (views,), (), views)
     scenes = choose_scene_views(tour)
     groups = tuple(dict.fromkeys(scenes.values()))
     edges = tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps)
-    return _Flights(tour.parts, groups, edges, tuple(dict.fromkeys(plan_walk(tour))))
+    return _PageGraph(tour.parts, groups, edges, tuple(dict.fromkeys(plan_walk(tour))))
 
 
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
@@ -257,9 +257,9 @@ def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, fl
     return find_start_angles(tour, view) or (find_widest(facts.outlooks[view]), 0.0)
 
 
-def _order_views(scene: Scene, flights: _Flights) -> list[int]:
+def _order_views(scene: Scene, graph: _PageGraph) -> list[int]:
     """The views of the part where the page starts, then the others; the nearest first."""
-    first, parts = flights.walk[0], np.array(flights.parts)
+    first, parts = graph.walk[0], np.array(graph.parts)
     distances = (scene.cam2world[:, :3, 3] - scene.cam2world[first, :3, 3]).norm(dim=1).numpy()
     return np.lexsort((distances, parts != parts[first])).tolist()
 
@@ -285,14 +285,14 @@ def _prepare(scene: Scene) -> Scene:
     return dataclasses.replace(scene, gaussians=gaussians, cam2world=poses, names=names)
 
 
-def _find_flown_parts(flights: _Flights, poor: Sequence[Edge]) -> set[int]:
+def _find_flown_parts(graph: _PageGraph, poor: Sequence[Edge]) -> set[int]:
     """The parts that have a flight, all without edges: in the others the page shows photographs only.
 
     Args:
         poor: edges along which no camera flies.
     """
-    flown = {flights.parts[a] for a, b, _ in flights.edges if a != b and (a, b) not in poor}
-    return flown if flights.edges else {*flights.parts}
+    flown = {graph.parts[a] for a, b, _ in graph.edges if a != b and (a, b) not in poor}
+    return flown if graph.edges else {*graph.parts}
 
 
 def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:
@@ -371,7 +371,7 @@ def _describe_scene(
     scene: Scene,
     packed: PackedGaussians,
     origin: Float[np.ndarray, "3"],
-    flights: _Flights,
+    graph: _PageGraph,
     tour: TourGraph,
     facts: TourFacts,
     flown: set[int],
@@ -399,7 +399,7 @@ def _describe_scene(
         }
         for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True))
     ]
-    reaches = _measure_reaches(scene, np.array(flights.parts))
+    reaches = _measure_reaches(scene, np.array(graph.parts))
     return {
         "count": sum(packed.counts),
         "degree": packed.degree,
@@ -408,16 +408,16 @@ def _describe_scene(
         "views": [{"start": each, "count": n} for each, n in zip(packed.starts, packed.counts, strict=True)],
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), spots, facts) if flights.edges else [],
+        "links": _describe_links(link_parts(tour), spots, facts) if graph.edges else [],
         "level": [_round(row) for row in level],
-        "parts": flights.parts,
-        "groups": flights.groups,
-        "edges": flights.edges,
-        "next": find_next_nodes(tour) if flights.edges else [],
+        "parts": graph.parts,
+        "groups": graph.groups,
+        "edges": graph.edges,
+        "next": find_next_nodes(tour) if graph.edges else [],
         "poor": tour.poor,
-        "walk": flights.walk,
+        "walk": graph.walk,
         "unit": 1 / scene.frame.unit,
-        "limits": _limit_parts(reaches, positions, flights, flown),
+        "limits": _limit_parts(reaches, positions, graph, flown),
     }
 
 
@@ -458,11 +458,11 @@ def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.n
 
 
 def _limit_parts(
-    reaches: Float[np.ndarray, "part"], positions: Float[np.ndarray, "view 3"], flights: _Flights, flown: set[int]
+    reaches: Float[np.ndarray, "part"], positions: Float[np.ndarray, "view 3"], graph: _PageGraph, flown: set[int]
 ) -> list[float]:
     """How far the camera may move in each part from its edges; without edges, from the nearest panorama."""
-    parts = list(flights.parts)
-    if not flights.edges and len(positions) > 1:
+    parts = list(graph.parts)
+    if not graph.edges and len(positions) > 1:
         distances = scipy.spatial.distance.cdist(positions, positions)
         longest_step = float(scipy.sparse.csgraph.minimum_spanning_tree(distances).toarray().max(initial=0.0))
         return [max(float(reaches[0]), 0.75 * longest_step)]
@@ -505,7 +505,7 @@ def _write_files(
         named = {_name_part(labels[view], chunk, "bin"): chunk for chunk in chunks}
         header["views"][view]["files"] = [*named]
         parts |= named
-        calls = [f"addPart({view}, {'true' if chunk is chunks[-1] else 'false'})" for chunk in chunks]
+        calls = [f"addChunk({view}, {'true' if chunk is chunks[-1] else 'false'})" for chunk in chunks]
         tags[view] = [
             f'<script type="text/plain">{base64.b64encode(chunk).decode()}</script><script>{call}</script>'
             for call, chunk in zip(calls, chunks, strict=True)

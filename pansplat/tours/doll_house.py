@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import list_pieces
+from pansplat.tours.floor import list_storeys_of_worlds
 from pansplat.tours.plan import Plan
 
 _USUAL_CEILING = 0.65  # height over the camera of one that is not seen, in heights of the camera
@@ -61,7 +61,7 @@ class Rooms:
 def find_rooms(facts: TourFacts) -> Rooms:
     """The rooms of a scene of all panoramas: those of the floor plan."""
     tour, plan = facts.tour, facts.plan
-    keys = list_pieces(tour)
+    keys = list_storeys_of_worlds(tour)
     enclosed = {view for room in plan.rooms if room.is_closed for view in room.panoramas}
     houses = []
     for key in dict.fromkeys(keys):

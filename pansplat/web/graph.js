@@ -2,8 +2,8 @@
 // pansplat.tours.graph, walks, limits and outlook that they name; tests/web/test_modules.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
-// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; the `reach` around a part,
-// within which a camera that has jumped is in it; and the `clearances` of panoramas, relative to the axes `level`.
+// on the way from one (row) to another one (column); the `poor` edges, along which the camera zooms; the `hysteresis` of a
+// change of edge; the `reach` around a part, within which a camera that has jumped is in it; and the `clearances` of panoramas, relative to the axes `level`.
 // Edges are numbers in `edges`.
 
 export const DEGREE = Math.PI / 180;
@@ -104,17 +104,17 @@ function limitAlong(graph, edge, start, end, part) {
   return minus(end, scaled(along, dot(minus(end, first), along) < length / 2 ? excess : -excess));
 }
 
-const isPoor = (graph, edge) => isFade(graph, ...graph.edges[edge].slice(0, 2));
+const isPoor = (graph, edge) => isZoom(graph, ...graph.edges[edge].slice(0, 2));
 
-// is_fade
-export const isFade = (graph, from, to) => {
+// is_zoom
+export const isZoom = (graph, from, to) => {
   return graph.parts[from] !== graph.parts[to] || graph.poor.some((edge) => edge.includes(from) && edge.includes(to) && from !== to);
 };
 
 // find_way
 export function findWay(graph, position, node, part = null) {
   const ends = graph.edges[nearestEdge(graph, position, part)].slice(0, 2), [from, to] = ends.map((end) => distanceOf(graph.positions[end], position));
-  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1]; // no camera flies to the other end
+  if (isZoom(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1]; // no camera flies to the other end
   const ways = ends.map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);
@@ -122,9 +122,9 @@ export function findWay(graph, position, node, part = null) {
   });
   const [first, second] = ways.map((way) => {
     const places = [position, ...way.map((each) => graph.positions[each])];
-    const fades = way.map((each, i) => i > 0 && isFade(graph, way[i - 1], each));
-    const lengths = fades.map((fade, i) => fade ? 0 : distanceOf(places[i], places[i + 1]));
-    return [fades.filter(Boolean).length, lengths.reduce((a, b) => a + b)];
+    const zooms = way.map((each, i) => i > 0 && isZoom(graph, way[i - 1], each));
+    const lengths = zooms.map((zoom, i) => zoom ? 0 : distanceOf(places[i], places[i + 1]));
+    return [zooms.filter(Boolean).length, lengths.reduce((a, b) => a + b)];
   });
   return first[0] < second[0] || (first[0] === second[0] && first[1] <= second[1]) ? ways[0] : ways[1];
 }

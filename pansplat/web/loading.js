@@ -33,7 +33,7 @@ function receive(view, isLast, chunk) {
 }
 
 // In a page of one file a script for each chunk of the data calls this.
-window.addPart = (view, isLast) => receive(view, isLast, takeText());
+window.addChunk = (view, isLast) => receive(view, isLast, takeText());
 
 // A file of the folder beside the page. A cache may hold what a server has answered in its place before.
 export async function fetchFile(name, isAgain) {
@@ -74,7 +74,7 @@ const countChunks = () => [...state.requested].reduce((sum, view) => sum + HEADE
 // Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all without edges.
 export function loadAround() {
   if (state.requested.size === HEADER.loading.length) return;
-  const nodes = [nodeHere(), ...(state.flight ? [state.flight.spot] : [])];
+  const nodes = [nodeHere(), ...(state.way ? [state.way.spot] : [])];
   const groups = edges.filter(([a, b]) => nodes.includes(a) || nodes.includes(b)).map(([, , each]) => each);
   const near = new Set([...groups, state.group].flatMap((each) => HEADER.groups[each]));
   const isAll = HEADER.folder === null || !edges.length;

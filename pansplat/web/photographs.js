@@ -131,7 +131,7 @@ class Photographs {
 
   // What is shown of a flight: the photographs of both ends, near them.
   findFlown() {
-    const [leg] = state.flight?.legs || [];
+    const [leg] = state.way?.legs || [];
     if (!leg?.path || !leg.done || state.headset.session) return null;
     const isFirst = leg.done < 0.5, node = isFirst ? leg.from : leg.to;
     const isReady = node !== null && this.levelsOf(node)[0].isReady;
@@ -192,7 +192,7 @@ class Photographs {
     }
     const isStill = this.last !== null && distanceOf(camera.position, this.last) === 0 || state.headset.session !== null;
     this.last = [...camera.position];
-    const next = state.flight?.legs.find(({ to }) => to !== undefined), flown = this.findFlown();
+    const next = state.way?.legs.find(({ to }) => to !== undefined), flown = this.findFlown();
     this.wanted = next ? next.to : nodeHere();
     this.read(this.wanted, size, next?.view);
     if (flown) {

@@ -53,7 +53,7 @@ export function findRings() {
 // Rings in perspective, and arrows at the border to those that are outside or under a control, and to panoramas of which no place
 // is known; none while the camera flies. A label that would cover a control or the label of a nearer ring is not shown.
 export function placeRings(rotation) {
-  const found = state.flight?.legs[0].path ? [] : findRings();
+  const found = state.way?.legs[0].path ? [] : findRings();
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
   const bars = ["buttons", "place", "plan"].map((id) => byId(id).getBoundingClientRect()).map((bar) => [bar.left, bar.top, bar.right, bar.bottom]);
   const taken = [...bars], sides = { left: 0, right: 0, up: 0, down: 0 };

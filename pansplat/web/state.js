@@ -37,7 +37,7 @@ export const state = {
   drawnScale: 0,
   lastChange: 0,
   // flight.js
-  flight: null,
+  way: null,
   isTouring: false,
   still: null,
   doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: [0, 0] },

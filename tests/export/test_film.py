@@ -10,7 +10,7 @@ import pytest
 import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
-from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, plan_visits, write_film
+from pansplat.export.film import Film, FilmPhotographs, follow_path, list_frames, plan_visits, write_film
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
@@ -120,9 +120,9 @@ def test_a_film_of_two_panoramas_moves_as_that_of_a_tour(scene: Scene) -> None:
     route = plan_visits(TourFacts(scene))
     kinds = [step.kind for step in route.steps]
     assert kinds == ["rest", "flight", "rest"] and route.walk == (0, 1)
-    shots = list_flight(route, 24.0, 75.0)
+    shots = list_frames(route, 24.0, 75.0)
     assert len(shots) == round(24 * route.seconds) and shots[-1].moment.photograph == 1
-    assert [shot.seconds for shot in list_flight(route, 24.0, 75.0, 0.01)] == [0, route.seconds], "two frames at least"
+    assert [shot.seconds for shot in list_frames(route, 24.0, 75.0, 0.01)] == [0, route.seconds], "two frames at least"
 
 
 def test_a_film_zooms_along_a_poor_edge_and_flies_along_others() -> None:

@@ -784,7 +784,7 @@ def test_a_tile_that_does_not_arrive_is_read_three_times_and_then_named(
 
 
 @pytest.mark.parametrize("case", ["missing", "late", "left"])
-def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
+def test_a_zoom_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
     chromium: Any, folder: Path, case: str
 ) -> None:
     """A tile of the preview is missing or late, or the camera leaves before it is there."""

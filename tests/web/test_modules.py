@@ -180,7 +180,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
             followed: graph.edges[followEdge(graph, position, current[i])],
             ways: graph.positions.map((_, node) => findWay(graph, position, node)),
             waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
-            fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+            zooms: graph.positions.map((_, node) => isZoom(graph, node, graph.edges[current[i]][0])),
             step: limitStep(graph, starts[i], position),
         }))""",
         graph,
@@ -195,7 +195,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         assert tuple(case["followed"]) == follow_edge(tour, position, edge)
         assert case["ways"] == [find_way(tour, position, node) for node in nodes]
         assert case["waysOfPart"] == [find_way(tour, position, node, 0) for node in nodes]
-        assert case["fades"] == [tour.is_zoom(node, edge[0]) for node in nodes]
+        assert case["zooms"] == [tour.is_zoom(node, edge[0]) for node in nodes]
     steps = [limit_step(tour, start, end) for start, end in zip(starts, positions, strict=True)]
     np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
     free = dataclasses.replace(tour, clearances={})

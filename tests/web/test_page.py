@@ -163,7 +163,7 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
             assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6) and link["mark"]
 
 
-def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_zooms_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = write_page(house, tmp_path / "good.html")
     assert (good.num_flights, good.zooms) == (2, ())
     monkeypatch.setattr(edges, "POOR", -9)
@@ -248,9 +248,9 @@ def test_gaussians_leave_bytes_to_photographs_that_need_them() -> None:
 
 def test_the_camera_flies_in_parts_with_a_good_edge() -> None:
     edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
-    flights = page_module._Flights((0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges, ())
-    assert page_module._find_flown_parts(flights, [(2, 3)]) == {0}
-    alone = dataclasses.replace(flights, edges=(), parts=(0,) * 5)
+    graph = page_module._PageGraph((0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges, ())
+    assert page_module._find_flown_parts(graph, [(2, 3)]) == {0}
+    alone = dataclasses.replace(graph, edges=(), parts=(0,) * 5)
     assert page_module._find_flown_parts(alone, ()) == {0}, "of a pair"
 
 
@@ -440,8 +440,8 @@ def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussian
     first, *others = header["loading"]
     names = [photograph["name"] for photograph in header["photographs"]]
     calls = re.findall(r"<script>(add\w+\([^<]*\))</script>", (tmp_path / "tour.html").read_text())
-    early = [f'addTile("{names[first]}", 0)', f"addPart({first}, true)", f'addTile("{names[first]}", 6)']
-    assert calls[:3] == early and calls[3:5] == [f"addPart({view}, true)" for view in others]
+    early = [f'addTile("{names[first]}", 0)', f"addChunk({first}, true)", f'addTile("{names[first]}", 6)']
+    assert calls[:3] == early and calls[3:5] == [f"addChunk({view}, true)" for view in others]
     assert calls[5:] == [f'addTile("{names[view]}", {number})' for view in others for number in (0, 6)]
 
 
