@@ -146,7 +146,7 @@ def choose_entry(entries: Sequence[SceneEntry], name: str | None) -> int:
     raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {name!r}")
 
 
-def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
+def list_panoramas_of_folder(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
     """The photographs of a folder among all entries, in the worlds and the unit of its files, by name."""
     from pansplat.geometry.world import USER_FRAME
 
