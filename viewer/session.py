@@ -17,8 +17,8 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.path import find_direction
 from pansplat.inputs.panorama_sets import Panorama
-from pansplat.tours.merge import list_starts
 from pansplat.tours.route import REST_SECONDS, Route
+from pansplat.tours.scene_graph import list_starts
 from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry

@@ -171,7 +171,7 @@ class Render(Computation):
         """The frames of a film: of a path, or of the flight through all input cameras."""
         from pansplat.export.film import follow_path, list_frames, plan_visits
         from pansplat.tours.facts import TourFacts
-        from pansplat.tours.merge import make_graph
+        from pansplat.tours.scene_graph import make_graph
 
         if path is not None:
             return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)

@@ -29,8 +29,9 @@ from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.limits import follow_edge
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.merge import select_views
 from pansplat.tours.route import REST_SECONDS, STOP_REACH, Moment, Route, find_offset, plan_route
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.scene_views import choose_scene_views
 from pansplat.tours.walks import plan_walk
 

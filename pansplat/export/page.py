@@ -57,9 +57,9 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.descriptions import describe_count, list_first
 from pansplat.system.files import SOFTWARE, is_written
 from pansplat.system.progress import report_progress, stage
-from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.houses import find_houses
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import find_link_ring, link_parts
 from pansplat.tours.merge import select_views
@@ -159,13 +159,13 @@ def write_page(
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
     facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
     tour = facts.graph
-    rooms = find_rooms(facts) if has_cameras else None
+    houses = find_houses(facts) if has_cameras else None
     scene = prepared
     graph = _plan_graph(tour, len(scene.cam2world))
     house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
-    if rooms is not None:
+    if houses is not None:
         report_progress("building the doll's house", 0.0)
-        house = make_house(scene, rooms, photographs if has_pictures else ())
+        house = make_house(scene, houses, photographs if has_pictures else ())
     flown = _find_flown_parts(graph, tour.poor) if has_pictures else {*graph.parts}
     views = [view for view, part in enumerate(graph.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))

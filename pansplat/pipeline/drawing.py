@@ -20,7 +20,7 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.devices import choose_device, note_full_card
-from pansplat.tours.merge import make_graph
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.scene_views import choose_scene_views
 
 Drawing = Literal["exact", "original"]

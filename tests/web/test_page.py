@@ -36,8 +36,9 @@ from pansplat.system.atomic import replacing
 from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_floor
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.merge import select_views
 from pansplat.tours.outlook import find_bins, measure_clearance, measure_outlook
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.surfaces import find_surfaces
 
 

@@ -184,7 +184,7 @@ def load_entry(
         scene = pipeline.load(entry.file)
         if scene.tour is None or scene.joint:  # the views of an edge alone lack surfaces of others
             return _with_facts(entry, scene)
-        from pansplat.tours.merge import make_graph
+        from pansplat.tours.scene_graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
         return _load_tour_scene(replace(entry, tour=tour, merged=scene), prediction, show)

@@ -12,8 +12,8 @@ from pansplat.geometry.path import level_axes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.limits import limit_step
-from pansplat.tours.merge import make_graph
 from pansplat.tours.route import NEAR_OF_FAR, Moment, Route, plan_route
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.walks import plan_walk
 from pansplat_viewer.core.camera import Camera, move_to_pose
 from pansplat_viewer.core.picking import PickedPoint
