@@ -23,7 +23,6 @@ from urllib.parse import quote, urljoin
 
 import msgspec
 import numpy as np
-import scipy
 import torch
 from jaxtyping import Float, Int
 from PIL import Image
@@ -61,7 +60,7 @@ from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.houses import find_houses
 from pansplat.tours.layout import REACH
-from pansplat.tours.links import find_link_ring, link_parts
+from pansplat.tours.links import choose_rings, link_parts
 from pansplat.tours.merge import select_views
 from pansplat.tours.outlook import find_turns, find_widest
 from pansplat.tours.route import find_angles, find_start_angles
@@ -80,7 +79,7 @@ _PROGRAM_BYTES = 200_000  # size of a page without its data
 _PART_BYTES = 1_500_000  # bytes of data between two steps of the progress bar; divisible by 3 for base64
 _FIT_STEPS = 8  # steps that fit merged Gaussians to the images of all Gaussians
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
-_NO_PLAN = {"worlds": (0,), "rooms": (), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
+_NO_PLAN = {"worlds": (0,), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 _SHADERS = {"splat": ("page.vert", "splat.frag"), "accumulate": ("screen.vert", "accumulate.frag")}
 _SHADERS |= {"resolve": ("screen.vert", "resolve.frag"), "mark": ("mark.vert", "mark.frag")}
@@ -158,15 +157,16 @@ def write_page(
         scene = dataclasses.replace(scene, starts=(), tour=None)
     has_cameras, prepared = len(scene.cam2world) > 0, _prepare(scene)
     facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
-    tour = facts.graph
+    is_tour = len(facts.tour.overlaps) > 0
+    tour = facts.graph if is_tour else facts.bounds
     houses = find_houses(facts) if has_cameras else None
     scene = prepared
-    graph = _plan_graph(tour, len(scene.cam2world))
+    graph = _plan_graph(tour) if is_tour else _join_all(tour)
     house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
     if houses is not None:
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, houses, photographs if has_pictures else ())
-    flown = _find_flown_parts(graph, tour.poor) if has_pictures else {*graph.parts}
+    flown = _find_flown_parts(graph, tour.poor) if has_pictures and is_tour else {*graph.parts}
     views = [view for view, part in enumerate(graph.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))
     scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(is_flown))
@@ -226,7 +226,7 @@ class _PageGraph:
     Attributes:
         parts: of each view; the camera moves within a part, and zooms to another one.
         groups: views that are blended together.
-        edges: two views and the group that is blended between them; without edges all views are blended.
+        edges: two views and the group that is blended between them.
         walk: all views, in the order of a visit.
     """
 
@@ -236,20 +236,18 @@ class _PageGraph:
     walk: tuple[int, ...]
 
 
-def _plan_graph(tour: TourGraph, count: int) -> _PageGraph:
-    """The graph of a page; without edges, the camera flies from view to view.
-
-    Args:
-        tour: of the scene.
-        count: number of views.
-    """
-    if not tour.overlaps:
-        views = tuple(range(count))
-        return _PageGraph((0,) * count, (views,), (), views)
+def _plan_graph(tour: TourGraph) -> _PageGraph:
+    """The graph of a tour."""
     scenes = choose_scene_views(tour)
     groups = tuple(dict.fromkeys(scenes.values()))
     edges = tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps)
     return _PageGraph(tour.parts, groups, edges, tuple(dict.fromkeys(plan_walk(tour))))
+
+
+def _join_all(tour: TourGraph) -> _PageGraph:
+    """The graph of a scene that is no tour, in which all views are blended everywhere."""
+    views = tuple(range(len(tour)))
+    return _PageGraph(tour.parts, (views,), tuple((a, b, 0) for a, b in tour.overlaps), views)
 
 
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
@@ -286,13 +284,12 @@ def _prepare(scene: Scene) -> Scene:
 
 
 def _find_flown_parts(graph: _PageGraph, poor: Sequence[Edge]) -> set[int]:
-    """The parts that have a flight, all without edges: in the others the page shows photographs only.
+    """The parts of a tour that have a flight: in the others the page shows photographs only.
 
     Args:
         poor: edges along which no camera flies.
     """
-    flown = {graph.parts[a] for a, b, _ in graph.edges if a != b and (a, b) not in poor}
-    return flown if graph.edges else {*graph.parts}
+    return {graph.parts[a] for a, b, _ in graph.edges if a != b and (a, b) not in poor}
 
 
 def _merge(scene: Scene, parts: Sequence[int], count: int, steps: int = _FIT_STEPS) -> Scene:
@@ -385,6 +382,7 @@ def _describe_scene(
     level = tour.level_axes
     positions = scene.cam2world[:, :3, 3].numpy() - origin
     marks = positions + np.outer(facts.usual_heights, level[:, 1])
+    linked, rooms = link_parts(tour), [room.panoramas for room in facts.plan.rooms] if len(positions) > 1 else []
     spots = [
         {
             "name": name,
@@ -394,7 +392,7 @@ def _describe_scene(
             "ahead": [round(angle, 5) for angle in _find_ahead(tour, facts, view)],
             "hasStart": tour.panoramas[view].start is not None,
             "turns": _round(find_turns(facts.outlooks[view])),
-            "hidden": facts.hidden[view],
+            "rings": _describe_rings(linked, facts, view, position, rooms),
             "clearances": tour.clearances[view].round(2).tolist(),
         }
         for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True))
@@ -408,16 +406,16 @@ def _describe_scene(
         "views": [{"start": each, "count": n} for each, n in zip(packed.starts, packed.counts, strict=True)],
         "loading": packed.order,
         "spots": spots,
-        "links": _describe_links(link_parts(tour), spots, facts) if graph.edges else [],
+        "links": _describe_links(linked),
         "level": [_round(row) for row in level],
         "parts": graph.parts,
         "groups": graph.groups,
         "edges": graph.edges,
-        "next": find_next_nodes(tour) if graph.edges else [],
+        "next": find_next_nodes(tour),
         "poor": tour.poor,
         "walk": graph.walk,
         "unit": 1 / scene.frame.unit,
-        "limits": _limit_parts(reaches, positions, graph, flown),
+        "limits": _limit_parts(reaches, graph.parts, flown),
     }
 
 
@@ -426,7 +424,6 @@ def _describe_plan(facts: TourFacts) -> dict[str, Any]:
     (svg, size, places), rooms = draw_page_plan(facts.plan), facts.plan.rooms
     return {
         "worlds": facts.tour.worlds,
-        "rooms": [room.panoramas for room in rooms],
         "isSure": all(room.is_placed for room in rooms),
         "drawing": base64.b64encode(svg).decode(),
         "size": size,
@@ -434,19 +431,22 @@ def _describe_plan(facts: TourFacts) -> dict[str, Any]:
     }
 
 
-def _describe_links(tour: TourGraph, spots: Sequence[dict[str, Any]], facts: TourFacts) -> list[dict[str, Any]]:
-    """The links of a page. Those to other parts, and those to panoramas whose marks are hidden, have a ring."""
+def _describe_links(tour: TourGraph) -> list[dict[str, Any]]:
     links = []
     for (start, end), link in tour.links.items():
         direction = tour.find_direction(start, end)
         assert direction is not None
         yaw, pitch = find_angles(direction)
-        found = {"from": start, "to": end, "text": link.text, "yaw": round(yaw, 5), "pitch": round(pitch, 5)}
-        ring = find_link_ring(tour, start, end, facts.usual_heights[start], facts.outlooks[start])
-        if ring is not None and (tour.parts[start] != tour.parts[end] or end in spots[start]["hidden"]):
-            found["mark"] = _round(np.array(spots[start]["position"]) + ring)
-        links.append(found)
+        links.append({"from": start, "to": end, "text": link.text, "yaw": round(yaw, 5), "pitch": round(pitch, 5)})
     return links
+
+
+def _describe_rings(
+    tour: TourGraph, facts: TourFacts, view: int, position: Float[np.ndarray, "3"], rooms: Sequence[Sequence[int]]
+) -> list[dict[str, Any]]:
+    """The rings that a page offers at a panorama."""
+    rings = choose_rings(tour, view, facts.usual_heights[view], facts.hidden[view], facts.outlooks[view], rooms)
+    return [{"node": node, "mark": None if offset is None else _round(position + offset)} for node, offset in rings]
 
 
 def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.ndarray, "part"]:
@@ -457,18 +457,11 @@ def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.n
     return np.array([max(float(np.median(each)) if len(each) else 0.0, 1e-3) for each in own])
 
 
-def _limit_parts(
-    reaches: Float[np.ndarray, "part"], positions: Float[np.ndarray, "view 3"], graph: _PageGraph, flown: set[int]
-) -> list[float]:
-    """How far the camera may move in each part from its edges; without edges, from the nearest panorama."""
-    parts = list(graph.parts)
-    if not graph.edges and len(positions) > 1:
-        distances = scipy.spatial.distance.cdist(positions, positions)
-        longest_step = float(scipy.sparse.csgraph.minimum_spanning_tree(distances).toarray().max(initial=0.0))
-        return [max(float(reaches[0]), 0.75 * longest_step)]
+def _limit_parts(reaches: Float[np.ndarray, "part"], parts: Sequence[int], flown: set[int]) -> list[float]:
+    """How far the camera may move in each part from its edges."""
     most = REACH if len(reaches) > 1 else math.inf
     limits = [
-        min(_SINGLE_REACH, 0.5 * reach) if parts.count(part) == 1 else min(reach, most)
+        min(_SINGLE_REACH, 0.5 * reach) if list(parts).count(part) == 1 else min(reach, most)
         for part, reach in enumerate(reaches.tolist())
     ]
     return [limit if part in flown else 0.0 for part, limit in enumerate(limits)]

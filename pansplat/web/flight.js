@@ -8,7 +8,7 @@ import { byId, calm, canvas, fullSize, say } from "./dom.js";
 import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isZoom, minus, nearestEdge, partOfEdge, plus, scaled, wrapAngle } from "./graph.js";
 import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
-import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, state } from "./state.js";
+import { camera, changed, currentPart, GRAPH, isComplete, makeStart, state } from "./state.js";
 
 const DOLL_SECONDS = 1.6; // duration of a flight out of the rooms, or into one
 const MAX_STILL = 8e6; // pixels of the image of a still, whose memory it limits
@@ -135,8 +135,7 @@ export function flyTo(spot) {
 
 // The legs of a way, and yaw and pitch at its end.
 function planWay(spot) {
-  const part = edges.length ? partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)) : 0;
-  const walk = edges.length ? findWay(GRAPH, camera.position, spot, part) : [spot];
+  const walk = findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)));
   const here = nodeHere(), ahead = { yaw: camera.yaw, pitch: camera.pitch }, legs = [];
   let from = nodeWithin(HEADER.stopReach), position = [...camera.position], heading = ahead, end = chooseArrival(spot, ahead);
   walk.forEach((node, i) => {
@@ -208,7 +207,7 @@ export function goHome() {
 // Goes to another camera; the image fades, unless the order of the Gaussians is right there too.
 function goToPose(pose) {
   const isFar = distanceOf(pose.position, camera.position) > NEAR;
-  const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
+  const isElsewhere = partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
   if (isFar || isElsewhere || state.headset.session) takeStill();
   place(pose);
 }

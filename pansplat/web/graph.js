@@ -57,19 +57,19 @@ export function followEdge(graph, position, current) {
   return distanceToEdge(graph, current, position) <= limit ? current : nearest;
 }
 
-// limit_step; in a scene without edges, surfaces alone limit it
+// limit_step
 export function limitStep(graph, start, end, part = null) {
-  const edge = graph.edges.length ? nearestEdge(graph, end, part) : null;
-  const target = edge !== null && isPoor(graph, edge) ? limitAlong(graph, edge, start, end, part) : end;
+  const edge = nearestEdge(graph, end, part);
+  const target = isPoor(graph, edge) ? limitAlong(graph, edge, start, end, part) : end;
   const most = Math.min(measureFree(graph, edge, start)[0], 0), [free, away] = measureFree(graph, edge, target);
   const slid = minus(target, scaled(away, Math.max(most - free, 0)));
   const isStep = distanceOf(slid, start) <= distanceOf(target, start) + 1e-9;
   return isStep && measureFree(graph, edge, slid)[0] >= most - 1e-9 ? slid : start;
 }
 
-// _measure_free; without an edge, of all panoramas
+// _measure_free
 function measureFree(graph, edge, place) {
-  const nodes = edge === null ? [...graph.positions.keys()] : graph.edges[edge].slice(0, 2);
+  const nodes = graph.edges[edge].slice(0, 2);
   const found = nodes.filter((node) => graph.clearances[node].length).map((node) => {
     const offset = minus(place, graph.positions[node]), distance = Math.hypot(...offset);
     const free = Math.max(findClearance(graph, node, offset) - distance - HEADER.clearance, HEADER.clearance - distance);
@@ -77,7 +77,7 @@ function measureFree(graph, edge, place) {
   });
   if (!found.length) return [Infinity, [0, 0, 0]];
   const [free, away] = found.reduce((best, each) => each[0] > best[0] ? each : best);
-  const beside = edge === null || isPoor(graph, edge) ? -Infinity : HEADER.clearance - distanceToEdge(graph, edge, place);
+  const beside = isPoor(graph, edge) ? -Infinity : HEADER.clearance - distanceToEdge(graph, edge, place);
   return [Math.max(free, beside), away];
 }
 

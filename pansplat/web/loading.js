@@ -71,15 +71,14 @@ function loadView(view, tries = 1) {
 
 const countChunks = () => [...state.requested].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
-// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all without edges.
+// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends.
 export function loadAround() {
   if (state.requested.size === HEADER.loading.length) return;
   const nodes = [nodeHere(), ...(state.way ? [state.way.spot] : [])];
   const groups = edges.filter(([a, b]) => nodes.includes(a) || nodes.includes(b)).map(([, , each]) => each);
   const near = new Set([...groups, state.group].flatMap((each) => HEADER.groups[each]));
-  const isAll = HEADER.folder === null || !edges.length;
   for (const view of HEADER.loading) {
-    if (state.requested.has(view) || !(isAll || near.has(view))) continue;
+    if (state.requested.has(view) || !(HEADER.folder === null || near.has(view))) continue;
     state.requested.add(view);
     canvas.ariaBusy = true;
     if (HEADER.folder !== null) loadView(view);

@@ -14,7 +14,7 @@ import { photographs } from "./photographs.js";
 import { drawAt } from "./picture.js";
 import { plan } from "./plan.js";
 import { placeRings, showPlace } from "./rings.js";
-import { camera, currentPart, edges, isComplete, isSortedFor, shown, state } from "./state.js";
+import { camera, currentPart, isComplete, isSortedFor, shown, state } from "./state.js";
 
 const SLOW_MS = 45, FAST_MS = 25; // times of a frame: above the first the resolution falls, below the second it rises
 const PAUSE_MS = 1000; // a longer frame is not measured
@@ -37,7 +37,7 @@ export function isSettled() {
 export function advance(now, seconds) {
   advanceWay(now);
   advanceDollFlight(now);
-  if (edges.length && !state.doll.isOn) updateEdge(now);
+  if (!state.doll.isOn) updateEdge(now);
   showViews(seconds / HEADER.fadeSeconds);
   photographs.update(seconds);
   updateStill(now);

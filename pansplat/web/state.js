@@ -22,7 +22,7 @@ export const shown = HEADER.views.map(() => 0);
 export const state = {
   // The edge at the camera, and the group that is blended there; `fade` is from the views of another group.
   edge: 0,
-  group: edges.length ? edges[0][2] : 0,
+  group: edges[0][2],
   fade: null,
   // Views whose data is requested, those whose data is there, and those whose data does not arrive and is still tried.
   requested: new Set(),
@@ -63,8 +63,8 @@ export function redraw() {
   changed();
 }
 
-export const currentPart = () => edges.length ? partOfEdge(GRAPH, state.edge) : 0;
-export const endsOfEdge = () => edges.length ? edges[state.edge].slice(0, 2) : [];
+export const currentPart = () => partOfEdge(GRAPH, state.edge);
+export const endsOfEdge = () => edges[state.edge].slice(0, 2);
 export const isComplete = () => [...state.requested].every((view) => state.received.has(view) || state.missing.has(view));
 
 // Whether the order is that of a camera; the doll's house needs none.

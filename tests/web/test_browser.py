@@ -85,6 +85,9 @@ CLOCK = """((waiting, time) => {
     };
 })([], 1e5);"""
 FRAME_MS = 30  # of it; the page keeps its resolution
+ALL_RINGS = """HEADER.spots.forEach((spot) => {
+    spot.rings = HEADER.spots.map((_, node) => ({ node, mark: null }));
+})"""
 # Messages to the worker wait while `isHolding`, until `release`.
 HOLD = """
     held = [], isHolding = () => false;
@@ -506,7 +509,7 @@ def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_ch
     chromium: Any, folder: Path
 ) -> None:
     with opened(chromium, folder / "tour.html", size=(640, 480), reduced_motion="reduce") as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run(ALL_RINGS)
         position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
         right, down, forward = in_level(page, np.subtract(mark, position))
         pose = {"position": position, "yaw": math.degrees(math.atan2(right, forward))}
@@ -617,7 +620,7 @@ def test_a_room_without_a_flight_shows_its_photograph_only(chromium: Any, folder
 
 def test_what_is_outside_of_the_picture_is_an_arrow_that_leads_there(chromium: Any, folder: Path) -> None:
     with opened(chromium, folder / "tour.html", size=(640, 480), is_stepped=True) as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run(ALL_RINGS)
         place, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
         right, _, ahead = in_level(page, np.subtract(mark, place))
         yaw, found = math.degrees(math.atan2(right, ahead)), []
@@ -645,7 +648,7 @@ def test_no_ring_is_under_the_buttons(chromium: Any, folder: Path) -> None:
         return [rings.some(isUnder), room.className];
     }"""
     with opened(chromium, folder / "tour.html", size=(640, 240)) as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run(ALL_RINGS)
         position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
         right, down, forward = in_level(page, np.subtract(mark, position))
         yaw = math.degrees(math.atan2(right, forward))

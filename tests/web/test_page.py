@@ -84,7 +84,7 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     found, (expected,) = header["plan"], TourFacts(room).plan.rooms
     svg, size, marks = draw_page_plan(TourFacts(room).plan)
-    assert found["rooms"] == [[0, 1]] and found["worlds"] == [0, 0] and b"west / east" in svg
+    assert found["worlds"] == [0, 0] and b"west / east" in svg
     assert base64.b64decode(found["drawing"]) == svg and found["size"] == pytest.approx(size)
     assert np.allclose(level, make_graph(room).level_axes) and np.allclose(found["places"], marks)
     c, s = math.cos(found["places"][0][2]), math.sin(found["places"][0][2])
@@ -101,15 +101,7 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
         for step in (0.3, -0.3)
     )
     assert inward > outward + 0.4, "normals are in the page's axes"
-    # What hides the mark of the other panorama is a wall between them.
-    assert [spot["hidden"] for spot in header["spots"]] == [[], []]
-    gaussians = room.gaussians
-    wall = gaussians.select((gaussians.views == 0) & (gaussians.means[:, 0] > 0.1))
-    offset = (wall.means - cameras[0, :3, 3].float()) * torch.tensor(0.3)
-    near = dataclasses.replace(wall, means=cameras[0, :3, 3].float() + offset, opacities=torch.ones(len(wall)))
-    hiding = Gaussians.cat([gaussians.select((gaussians.views == 1) | (gaussians.means[:, 0] <= 0.1)), near])
-    write_page(dataclasses.replace(room, gaussians=hiding), tmp_path / "wall.html")
-    assert [spot["hidden"] for spot in read_header(tmp_path / "wall.html")["spots"]] == [[1], []]
+    assert [[ring["node"] for ring in spot["rings"]] for spot in header["spots"]] == [[1, 0], [0, 1]]
 
 
 def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Scene, tmp_path: Path) -> None:
@@ -161,7 +153,8 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
     for link in header["links"]:
         if 3 in (link["from"], link["to"]):
             right, _, ahead = level.T @ (places[link["to"]] - places[link["from"]])
-            assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6) and link["mark"]
+            assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6)
+            assert any(ring["node"] == link["to"] and ring["mark"] for ring in spots[link["from"]]["rings"])
 
 
 def test_a_page_zooms_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +192,9 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4) and to["pitch"] == -0.6
-    right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
+    (ring,) = (ring for ring in spots[0]["rings"] if ring["mark"])
+    assert ring["node"] == 2
+    right, down, ahead = level.T @ np.subtract(ring["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
     wall = measure_outlook(find_surfaces(flat, level)[0])[find_bins(np.array(0.5 * math.pi))]
     assert (right, ahead) == pytest.approx((max(down / np.tan(0.6), 1), 0), rel=0.01, abs=1e-5) and right < wall
@@ -251,8 +246,6 @@ def test_the_camera_flies_in_parts_with_a_good_edge() -> None:
     edges = ((0, 1, 0), (2, 3, 1), (4, 4, 2))
     graph = page_module._PageGraph((0, 0, 1, 1, 2), ((0, 1), (2, 3), (4,)), edges, ())
     assert page_module._find_flown_parts(graph, [(2, 3)]) == {0}
-    alone = dataclasses.replace(graph, edges=(), parts=(0,) * 5)
-    assert page_module._find_flown_parts(alone, ()) == {0}, "of a pair"
 
 
 def test_the_page_loads_nothing_from_elsewhere(scene: Scene, tmp_path: Path) -> None:
@@ -505,7 +498,8 @@ def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, t
     fused = dataclasses.replace(house, joint=True)
     with pytest.warns(InputWarning, match="Export the folder of the photographs"):
         header = read_header(write_page(fused, tmp_path / "house.html").files[0])
-    assert len(header["spots"]) == 3 and header["edges"] == [] and header["count"] == len(house.gaussians)
+    assert header["edges"] == [[0, 1, 0], [0, 2, 0], [1, 2, 0]] and header["groups"] == [[0, 1, 2]]
+    assert header["count"] == len(house.gaussians)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         write_page(dataclasses.replace(fused, tour=None), tmp_path / "pair.html")
