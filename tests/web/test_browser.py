@@ -29,6 +29,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.export import page as page_module
+from pansplat.export import page_files
 from pansplat.export.page import PageFiles, write_page
 from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
@@ -211,7 +212,7 @@ def folder(
     folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
-        patch.setattr(page_module, "_PART_BYTES", 30_000)
+        patch.setattr(page_files, "_PART_BYTES", 30_000)
         patch.setattr(TourFacts, "poor", ())  # surfaces of the scenes do not agree
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)

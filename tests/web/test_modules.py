@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.export.page import _bundle_programs
 from pansplat.export.page_data import PageConstants, PageHeader
+from pansplat.export.page_program import bundle_programs
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.tours.graph import TourGraph
@@ -57,7 +57,7 @@ def test_modules_that_need_no_browser_import_no_others() -> None:
 
 
 def test_the_modules_share_one_scope(node: str, tmp_path: Path) -> None:
-    (tmp_path / "program.js").write_text(re.sub("</?script>", "", _bundle_programs()))
+    (tmp_path / "program.js").write_text(re.sub("</?script>", "", bundle_programs()))
     done = subprocess.run([node, "--check", tmp_path / "program.js"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 

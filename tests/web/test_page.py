@@ -24,6 +24,7 @@ from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
+from pansplat.export import page_files, page_scene
 from pansplat.export.page import choose_gaussians, write_page
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
@@ -231,7 +232,7 @@ def test_the_camera_stays_within_a_metre_of_a_single_photograph(
 def test_panoramas_of_all_parts_that_have_gaussians_keep_as_many(flat: Scene) -> None:
     without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
     for scene, count, third in ((flat, 800, 200), (without, 600, 0)):
-        merged = page_module._merge(scene, (0, 0, 1, 2), count)
+        merged = page_scene.merge(scene, (0, 0, 1, 2), count)
         counts = np.bincount(merged.gaussians.views.numpy())
         assert counts[0] + counts[1] == 400 and counts[2] == third and counts[3] == 200
         assert torch.equal(merged.cam2world, flat.cam2world)
@@ -269,7 +270,7 @@ def test_colours_of_merged_gaussians_are_fitted_to_all(request: pytest.FixtureRe
     needed = pipeline.render(full, pose, size=size, blend=0).color
     errors = [
         float((pipeline.render(scene, pose, size=size, blend=0).color - needed).square().mean())
-        for scene in (page_module._merge(full, (0,) * len(full.cam2world), 700), merge_to(full, (64, 128), 700))
+        for scene in (page_scene.merge(full, (0,) * len(full.cam2world), 700), merge_to(full, (64, 128), 700))
     ]
     assert errors[0] < 0.8 * errors[1]
 
@@ -311,18 +312,18 @@ def _measure_dots(scene: Scene, full: Scene) -> float:
 
 def test_merged_gaussians_are_lines_and_not_dots_in_large_images(monkeypatch: pytest.MonkeyPatch) -> None:
     full = _make_beams()
-    assert _measure_dots(page_module._merge(full, (0,), 3000, steps=0), full) > 2  # colours alone
-    assert _measure_dots(page_module._merge(full, (0,), 3000), full) < 1
-    monkeypatch.setattr(page_module, "DISPLAY_HEIGHT", full.height)  # fitted at the scene's own rows
-    assert _measure_dots(page_module._merge(full, (0,), 3000), full) > 1.2
+    assert _measure_dots(page_scene.merge(full, (0,), 3000, steps=0), full) > 2  # colours alone
+    assert _measure_dots(page_scene.merge(full, (0,), 3000), full) < 1
+    monkeypatch.setattr(page_scene, "DISPLAY_HEIGHT", full.height)  # fitted at the scene's own rows
+    assert _measure_dots(page_scene.merge(full, (0,), 3000), full) > 1.2
 
 
 def test_merged_gaussians_of_a_scene_whose_views_are_unknown_keep_their_image(plain_scene: Scene) -> None:
     foreign = dataclasses.replace(
         plain_scene, gaussians=dataclasses.replace(plain_scene.gaussians, views=7 + plain_scene.gaussians.views)
     )
-    full = page_module._prepare(foreign)
-    merged = page_module._merge(full, (0, 0), 700)
+    full = page_scene.prepare(foreign)
+    merged = page_scene.merge(full, (0, 0), 700)
     for pose in full.cam2world:  # the second camera has no Gaussians of its own
         images = [pipeline.render(scene, pose, blend="joint", size=(32, 64)).color for scene in (full, merged)]
         assert float((images[1] - images[0]).abs().mean()) < 0.05
@@ -395,15 +396,15 @@ def test_an_export_that_ends_during_another_one_removes_none_of_its_parts(
             yield temporary
         counts.append(file.suffix)
         if file.suffix == ".bin" and counts.count(".bin") == (1 if at == "first part" else 3):
-            monkeypatch.setattr(page_module, "replacing", replacing)
+            monkeypatch.setattr(page_files, "replacing", replacing)
             write_page(scene, path, split=True, gaussians=900)
 
-    monkeypatch.setattr(page_module, "replacing", interrupted)
+    monkeypatch.setattr(page_files, "replacing", interrupted)
     for gaussians in (1500, page_module.DEFAULT_GAUSSIANS):  # other parts than before, and the same
         counts.clear()
         last = write_page(scene, path, split=True, gaussians=gaussians)
         assert set((tmp_path / "tour_files").iterdir()) == set(last.files[1:])
-        monkeypatch.setattr(page_module, "replacing", interrupted)
+        monkeypatch.setattr(page_files, "replacing", interrupted)
 
 
 def test_the_parts_of_a_copy_of_a_page_stay(scene: Scene, tmp_path: Path) -> None:
@@ -473,7 +474,7 @@ def test_pages_that_cannot_be_drawn_or_written_are_refused(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     empty = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
-    monkeypatch.setattr(page_module, "MAX_FILE_BYTES", 60_000)
+    monkeypatch.setattr(page_files, "MAX_FILE_BYTES", 60_000)
     for given, name, options, message in (
         (empty, "tour.html", {}, "no visible Gaussians"),
         (scene, "tour.html", {}, r"write a folder.*at most [\d,]+ Gaussians"),
