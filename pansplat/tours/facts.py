@@ -136,7 +136,8 @@ class TourFacts:
     @cached_property
     def graph(self) -> TourGraph:
         """The tour with what its surfaces show: walls in place of edges, poor edges, and clearances."""
-        tour, clearances = self.tour.with_walls(self.walls), dict(zip(self.views, self.clearances, strict=True))
+        tour = self.tour.with_walls(self.walls) if self.walls else self.tour
+        clearances = dict(zip(self.views, self.clearances, strict=True))
         poor = tuple(edge for edge in self.poor if edge in tour.overlaps)
         return dataclasses.replace(tour, poor=poor, clearances=clearances)
 

@@ -122,8 +122,6 @@ class TourGraph:
     def with_walls(self, walls: Iterable[Edge]) -> TourGraph:
         """The graph with further walls in place of edges; a node without another edge gets a self-edge."""
         every = tuple(dict.fromkeys((*self.walls, *walls)))
-        if every == self.walls:
-            return self
         overlaps = {edge: overlap for edge, overlap in self.overlaps.items() if edge not in every}
         return dataclasses.replace(self, overlaps=add_self_edges(overlaps, range(len(self))), walls=every)
 

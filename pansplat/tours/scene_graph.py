@@ -70,4 +70,4 @@ def _make_graph(scene: Scene, tour: SceneTour) -> TourGraph:
     walls = [(a, b) for a, b, overlap in tour.overlaps if a != b and overlap == 0]
     overlaps = {(a, b): overlap for a, b, overlap in tour.overlaps}
     graph = TourGraph("", Path(), panoramas, scene.near, scene.far, overlaps=overlaps)
-    return graph.with_walls(walls)
+    return graph.with_walls(walls) if walls else graph
