@@ -29,6 +29,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.export import page as page_module
+from pansplat.export import page_files
 from pansplat.export.page import PageFiles, write_page
 from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
@@ -38,9 +39,10 @@ from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.panorama_sets import Note, PanoramaSet
 from pansplat.notebook import _bundle_scene
-from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.houses import find_houses
+from pansplat.tours.merge import select_views
+from pansplat.tours.scene_graph import make_graph
 
 SIZE = (320, 240)
 LIMIT = 180  # seconds, after which a state that the page does not reach is an error
@@ -84,6 +86,9 @@ CLOCK = """((waiting, time) => {
     };
 })([], 1e5);"""
 FRAME_MS = 30  # of it; the page keeps its resolution
+ALL_RINGS = """HEADER.spots.forEach((spot) => {
+    spot.rings = HEADER.spots.map((_, node) => ({ node, mark: null }));
+})"""
 # Messages to the worker wait while `isHolding`, until `release`.
 HOLD = """
     held = [], isHolding = () => false;
@@ -207,7 +212,7 @@ def folder(
     folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
-        patch.setattr(page_module, "_PART_BYTES", 30_000)
+        patch.setattr(page_files, "_PART_BYTES", 30_000)
         patch.setattr(TourFacts, "poor", ())  # surfaces of the scenes do not agree
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)
@@ -415,7 +420,7 @@ def test_the_dolls_house_opens_when_the_gaussians_have_arrived(chromium: Any, ro
 def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_back_inside(
     chromium: Any, room: Scene, room_photographs: list[PanoramaSet], room_page: Path
 ) -> None:
-    photographs, rooms = room_photographs, find_rooms(TourFacts(room))
+    photographs, houses = room_photographs, find_houses(TourFacts(room))
     origin, cameras = room.cam2world[:, :3, 3].mean(0).numpy(), room.cam2world[:, :3, 3].numpy()
     with opened(chromium, room_page) as page:
         page.page.emulate_media(reduced_motion="reduce")
@@ -432,13 +437,13 @@ def test_the_dolls_house_shows_the_photographs_on_its_floor_and_a_click_goes_bac
         tangent = math.tan(math.radians(45 / 2))
         turned = aim(level, camera)
         rays = np.stack((x * tangent, y * tangent, np.ones_like(x)), axis=-1) @ turned.T
-        eye, down = camera["position"] + origin, rooms.level[:, 1]
-        floor = float(np.mean(cameras @ down + rooms.floors))
+        eye, down = camera["position"] + origin, houses.level[:, 1]
+        floor = float(np.mean(cameras @ down + houses.floors))
         places = eye + ((floor - eye @ down) / (rays @ down))[..., None] * rays
-        outline, flat = rooms.plan.rooms[0].shape, places @ rooms.level[:, (0, 2)]
+        outline, flat = houses.plan.rooms[0].shape, places @ houses.level[:, (0, 2)]
         nearest = np.linalg.norm(places[:, :, None] - cameras, axis=-1)
         is_clear = shapely.contains_xy(outline.buffer(-0.1), flat[..., 0], flat[..., 1])
-        is_clear &= (np.abs(nearest[..., 0] - nearest[..., 1]) > 0.5) & (nearest.min(axis=-1) > 1.3 * rooms.floors[0])
+        is_clear &= (np.abs(nearest[..., 0] - nearest[..., 1]) > 0.5) & (nearest.min(axis=-1) > 1.3 * houses.floors[0])
         assert is_clear.mean() > 0.03
         for view in (0, 1):
             chosen = is_clear & (nearest.argmin(axis=-1) == view)
@@ -505,7 +510,7 @@ def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_ch
     chromium: Any, folder: Path
 ) -> None:
     with opened(chromium, folder / "tour.html", size=(640, 480), reduced_motion="reduce") as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run(ALL_RINGS)
         position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
         right, down, forward = in_level(page, np.subtract(mark, position))
         pose = {"position": position, "yaw": math.degrees(math.atan2(right, forward))}
@@ -616,7 +621,7 @@ def test_a_room_without_a_flight_shows_its_photograph_only(chromium: Any, folder
 
 def test_what_is_outside_of_the_picture_is_an_arrow_that_leads_there(chromium: Any, folder: Path) -> None:
     with opened(chromium, folder / "tour.html", size=(640, 480), is_stepped=True) as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run(ALL_RINGS)
         place, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
         right, _, ahead = in_level(page, np.subtract(mark, place))
         yaw, found = math.degrees(math.atan2(right, ahead)), []
@@ -644,7 +649,7 @@ def test_no_ring_is_under_the_buttons(chromium: Any, folder: Path) -> None:
         return [rings.some(isUnder), room.className];
     }"""
     with opened(chromium, folder / "tour.html", size=(640, 240)) as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run(ALL_RINGS)
         position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
         right, down, forward = in_level(page, np.subtract(mark, position))
         yaw = math.degrees(math.atan2(right, forward))
@@ -784,7 +789,7 @@ def test_a_tile_that_does_not_arrive_is_read_three_times_and_then_named(
 
 
 @pytest.mark.parametrize("case", ["missing", "late", "left"])
-def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
+def test_a_zoom_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
     chromium: Any, folder: Path, case: str
 ) -> None:
     """A tile of the preview is missing or late, or the camera leaves before it is there."""

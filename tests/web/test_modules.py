@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.export.page import _bundle_programs
 from pansplat.export.page_data import PageConstants, PageHeader
+from pansplat.export.page_program import bundle_programs
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.tours.graph import TourGraph
@@ -57,7 +57,7 @@ def test_modules_that_need_no_browser_import_no_others() -> None:
 
 
 def test_the_modules_share_one_scope(node: str, tmp_path: Path) -> None:
-    (tmp_path / "program.js").write_text(re.sub("</?script>", "", _bundle_programs()))
+    (tmp_path / "program.js").write_text(re.sub("</?script>", "", bundle_programs()))
     done = subprocess.run([node, "--check", tmp_path / "program.js"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 
@@ -127,7 +127,7 @@ def make_header(positions: list[tuple[float, ...]], edges: list[tuple[int, int]]
         "level": np.eye(3).tolist(),
         "walk": [*range(len(positions))],
         "edges": [(*edge, group) for group, edge in enumerate(edges)],
-        "groups": [sorted({*edge}) for edge in edges] or [list(range(len(positions)))],
+        "groups": [sorted({*edge}) for edge in edges],
         "parts": parts,
         "limits": [2.0] * (max(parts) + 1),
         "poor": [],
@@ -180,7 +180,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
             followed: graph.edges[followEdge(graph, position, current[i])],
             ways: graph.positions.map((_, node) => findWay(graph, position, node)),
             waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
-            fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+            zooms: graph.positions.map((_, node) => isZoom(graph, node, graph.edges[current[i]][0])),
             step: limitStep(graph, starts[i], position),
         }))""",
         graph,
@@ -195,7 +195,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         assert tuple(case["followed"]) == follow_edge(tour, position, edge)
         assert case["ways"] == [find_way(tour, position, node) for node in nodes]
         assert case["waysOfPart"] == [find_way(tour, position, node, 0) for node in nodes]
-        assert case["fades"] == [tour.is_zoom(node, edge[0]) for node in nodes]
+        assert case["zooms"] == [tour.is_zoom(node, edge[0]) for node in nodes]
     steps = [limit_step(tour, start, end) for start, end in zip(starts, positions, strict=True)]
     np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
     free = dataclasses.replace(tour, clearances={})
@@ -208,39 +208,6 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         (tour.parts[edge[0]], tour.parts[edges[number][0]]) for edge, number in zip(followed, current, strict=True)
     ]
     assert len({a == b for a, b in parts}) == 2, "a position near another part is in it"
-
-
-def choose_rings(node: str, folder: Path, *, links: Any = (), hidden: Any = (), rooms: Any = (), here: int = 0) -> list:
-    """The rings of a panorama in a row of four, the last one in another part, with `{from, to, mark}` of links."""
-    header = make_header(ROW, [(0, 1), (0, 2), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"links": list(links)}
-    header["plan"] = {"rooms": list(rooms)}
-    for number, spot in enumerate(header["spots"]):
-        spot["hidden"] = list(hidden) if number == here else []
-    found = run(node, folder, header, "(here) => chooseRings(here)", here)
-    return [(ring["node"], None if ring["link"] is None else ring["link"]["from"]) for ring in found]
-
-
-def test_the_rings_of_a_panorama_are_its_own_links_and_its_flights(node: str, tmp_path: Path) -> None:
-    door = {"from": 1, "to": 3, "mark": [0, 0, 0]}
-    assert choose_rings(node, tmp_path, links=[door]) == [(1, None), (2, None), (0, None)], "not those of the next one"
-    assert choose_rings(node, tmp_path, links=[door], here=1)[0] == (3, 1)
-    assert choose_rings(node, tmp_path, links=[{"from": 0, "to": 3}]) == [(1, None), (2, None), (0, None)], "no place"
-    assert choose_rings(node, tmp_path, links=[door], here=3) == [(1, None), (3, None)], "what leads here"
-    assert choose_rings(node, tmp_path, here=3) == [(0, None), (3, None)], "the nearest one, where nothing leads"
-
-
-def test_surfaces_hide_rings_but_those_of_the_photographs_own_links(node: str, tmp_path: Path) -> None:
-    assert choose_rings(node, tmp_path, hidden=[1]) == [(2, None), (0, None)]
-    assert choose_rings(node, tmp_path, hidden=[1, 2]) == [(1, None), (0, None)], "the nearest one is left"
-    arrow = {"from": 0, "to": 2, "mark": [0, 0, 0]}
-    assert choose_rings(node, tmp_path, hidden=[1, 2], links=[arrow]) == [(2, 0), (0, None)], "on its arrow"
-
-
-def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
-    assert choose_rings(node, tmp_path, rooms=[[1, 2]]) == [(1, None), (0, None)], "the nearest one"
-    assert choose_rings(node, tmp_path, rooms=[[0, 1, 2]]) == [(1, None), (2, None), (0, None)], "its own one has all"
-    linked = choose_rings(node, tmp_path, rooms=[[1, 2]], links=[{"from": 0, "to": 2}])
-    assert linked == [(2, None), (0, None)], "that of a link comes before"
 
 
 def test_a_way_ends_in_the_start_view_or_straight_on_and_away_from_the_link_back(node: str, tmp_path: Path) -> None:
@@ -312,13 +279,9 @@ def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it
     assert ahead[2] > 4 and back[2] == pytest.approx(1.5), "the other edge can be walked"
 
 
-@pytest.mark.parametrize("edges", [[], [(0, 1), (1, 2), (3, 3)]])
-def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(
-    edges: list[tuple[int, int]], node: str, tmp_path: Path
-) -> None:
+def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(node: str, tmp_path: Path) -> None:
     """The surfaces around the first panorama are 0.6 m away, but those ahead 1.4 m."""
-    parts = [0, 0, 0, 1] if edges else [0] * 4
-    header = make_header(ROW, edges, parts)
+    header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1])
     header["spots"][0]["clearances"] = [[0.6] * 24, *[[0.6] * 11 + [1.4] * 2 + [0.6] * 11] * 10, [0.6] * 24]
     program = f"""(steps, position) => {{
         {SORTED}
@@ -336,9 +299,8 @@ def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(
     assert placed[0] == pytest.approx(0.9, abs=0.01) and back[0] < 0.3, "it can go back"
     (slid,) = run(node, tmp_path, header, program, [(0.02, 0, 0.004)], [0.33, 0, -0.1])
     assert slid[2] > 0 and math.hypot(slid[0], slid[2]) < 0.36, "it slides along"
-    if edges:
-        (beside,) = run(node, tmp_path, header, program, [(0, 0, 0.03)], [0, 0, 0])
-        assert beside[2] > 2.5, "along a flight it is free"
+    (beside,) = run(node, tmp_path, header, program, [(0, 0, 0.03)], [0, 0, 0])
+    assert beside[2] > 2.5, "along a flight it is free"
 
 
 def test_nothing_walks_before_the_gaussians_are_sorted_or_in_the_dolls_house(node: str, tmp_path: Path) -> None:
