@@ -55,16 +55,6 @@ def _rasterize_stereo() -> None:
         rasterize(_make_gaussians(0), torch.eye(4), size=(16, 32), eye_offset=0.03, backend="numba")
 
 
-def _compare() -> None:
-    """Compare an image with a photograph, with the gradient."""
-    import torch
-
-    from pansplat.refinement.objective import PixelWeights, image_difference
-
-    weights = PixelWeights.from_mask(torch.ones(16, 32, dtype=torch.bool))
-    image_difference(torch.zeros(3, 16, 32, requires_grad=True), weights).backward()
-
-
 def _make_gaussians(degree: int) -> Gaussians:
     import torch
 
@@ -118,7 +108,6 @@ STEPS = (
     (
         partial(_rasterize, 0, "equirect"),
         partial(_rasterize, 1, "pinhole"),
-        _compare,
         _rasterize_stereo,
         _draw_display_image,
     ),
