@@ -124,65 +124,6 @@ def _backward_band(gradient, reference, other, x, y, wraps, grad_reference, grad
                 _accumulate_gradients(weights, reference[i, j], other, rows, columns, grad_reference[i, j], grad_other)
 
 
-def correlate_positions(
-    reference: Float[Tensor, "pair channel height width"],
-    other: Float[Tensor, "pair channel height width"],
-    columns: Float[Tensor, "pair candidate height width"],
-    rows: Float[Tensor, "pair candidate height width"],
-    *,
-    wraps: bool,
-) -> Float[Tensor, "pair candidate height width"]:
-    """Dot products of each pixel's features with bilinear samples of the other panorama.
-
-    Args:
-        reference, other: features; all tensors are on the CPU and of one type (float32 or float64).
-        columns, rows: positions in `other`; 0 is the first pixel's centre, at most one pixel beyond the border.
-        wraps: columns wrap and rows continue over the poles; otherwise the border pixels are repeated.
-    """
-    height = reference.shape[2]
-    out = torch.empty_like(columns, memory_format=torch.contiguous_format)
-    reference_maps, other_maps = _to_channels_last(reference), _to_channels_last(other)
-    x, y, result = columns.contiguous().numpy(), rows.contiguous().numpy(), out.numpy()
-    bands = _split_rows(height)
-
-    def work(pair: int, band: int) -> None:
-        _correlate_band(reference_maps[pair], other_maps[pair], x[pair], y[pair], wraps, result[pair], *bands[band])
-
-    _run_bands(work, reference.shape[0], len(bands))
-    return out
-
-
-def correlate_positions_backward(
-    gradient: Float[Tensor, "pair candidate height width"],
-    reference: Float[Tensor, "pair channel height width"],
-    other: Float[Tensor, "pair channel height width"],
-    columns: Float[Tensor, "pair candidate height width"],
-    rows: Float[Tensor, "pair candidate height width"],
-    *,
-    wraps: bool,
-) -> tuple[Float[Tensor, "pair channel height width"], Float[Tensor, "pair channel height width"]]:
-    """Gradients of `correlate_positions` with respect to both panoramas' features."""
-    pairs, channels, height, width = reference.shape
-    reference_maps, other_maps = _to_channels_last(reference), _to_channels_last(other)
-    upstream = gradient.contiguous().numpy()
-    x, y = columns.contiguous().numpy(), rows.contiguous().numpy()
-    bands = _split_rows(height)
-    grad_reference = np.zeros((pairs, height, width, channels), reference_maps.dtype)
-    grad_other = np.zeros_like(grad_reference)
-    for pair in range(pairs):
-        sums = np.zeros((len(bands), height, width, channels), reference_maps.dtype)
-
-        def work(_: int, band: int, pair: int = pair, sums: np.ndarray = sums) -> None:
-            both = (grad_reference[pair], sums[band])
-            _backward_band(
-                upstream[pair], reference_maps[pair], other_maps[pair], x[pair], y[pair], wraps, *both, *bands[band]
-            )
-
-        _run_bands(work, 1, len(bands))
-        sums.sum(axis=0, out=grad_other[pair])
-    return torch.from_numpy(grad_reference).movedim(-1, 1), torch.from_numpy(grad_other).movedim(-1, 1)
-
-
 def _to_channels_last(maps: Tensor) -> np.ndarray:
     return maps.detach().movedim(1, -1).contiguous().numpy()
 
@@ -271,15 +212,37 @@ def _backward_by_warp(
 
 
 def _correlate_by_kernel(reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling) -> Tensor:
-    positions = warp_positions(chunk, pose, sampling)
-    return correlate_positions(reference, other, *positions, wraps=sampling == "sphere")
+    out = torch.empty_like(chunk, memory_format=torch.contiguous_format)
+    reference_maps, other_maps, wraps = _to_channels_last(reference), _to_channels_last(other), sampling == "sphere"
+    x, y = (positions.contiguous().numpy() for positions in warp_positions(chunk, pose, sampling))
+    result, bands = out.numpy(), _split_rows(reference.shape[2])
+
+    def work(pair: int, band: int) -> None:
+        _correlate_band(reference_maps[pair], other_maps[pair], x[pair], y[pair], wraps, result[pair], *bands[band])
+
+    _run_bands(work, len(chunk), len(bands))
+    return out
 
 
 def _backward_by_kernel(
     part: Tensor, reference: Tensor, other: Tensor, chunk: Tensor, pose: Tensor, sampling: Sampling
 ) -> tuple[Tensor, Tensor]:
-    positions = warp_positions(chunk, pose, sampling)
-    return correlate_positions_backward(part, reference, other, *positions, wraps=sampling == "sphere")
+    reference_maps, other_maps, wraps = _to_channels_last(reference), _to_channels_last(other), sampling == "sphere"
+    x, y = (positions.contiguous().numpy() for positions in warp_positions(chunk, pose, sampling))
+    upstream, bands = part.contiguous().numpy(), _split_rows(reference.shape[2])
+    grad_reference, grad_other = np.zeros_like(reference_maps), np.zeros_like(other_maps)
+    for pair in range(len(chunk)):
+        sums = np.zeros((len(bands), *other_maps.shape[1:]), other_maps.dtype)
+
+        def work(_: int, band: int, pair: int = pair, sums: np.ndarray = sums) -> None:
+            both = (grad_reference[pair], sums[band])
+            _backward_band(
+                upstream[pair], reference_maps[pair], other_maps[pair], x[pair], y[pair], wraps, *both, *bands[band]
+            )
+
+        _run_bands(work, 1, len(bands))
+        sums.sum(axis=0, out=grad_other[pair])
+    return torch.from_numpy(grad_reference).movedim(-1, 1), torch.from_numpy(grad_other).movedim(-1, 1)
 
 
 def _chunks(inverse_depth: Tensor, reference: Tensor) -> tuple[Tensor, ...]:

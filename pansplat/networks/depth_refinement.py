@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, normalize, relu, unfold
 
-from pansplat.geometry.correlation import correlate, correlate_positions
+from pansplat.geometry.correlation import correlate
 from pansplat.geometry.equirect import pad_equirect, pixel_directions
 from pansplat.geometry.warp import relative_pose, sample_maps, warp_positions
 from pansplat.networks.depth_network import (
@@ -173,8 +173,6 @@ def _multiply_at(
     rows: Float[Tensor, "pair d h w"],
 ) -> Float[Tensor, "pair d h w"]:
     """Dot products of each pixel's features with samples of the other view's, without gradient."""
-    if reference.device.type == "cpu":
-        return correlate_positions(reference, other, columns, rows, wraps=True)
     return torch.einsum("nchw,ncdhw->ndhw", reference, sample_maps(other, columns, rows, "sphere"))
 
 

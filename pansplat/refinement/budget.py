@@ -22,7 +22,7 @@ from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.morton import morton_codes
 from pansplat.geometry.pose import interpolate_poses, nearest_views, quats_from_rotations
-from pansplat.rendering.weights import compute_blending_weights
+from pansplat.rendering.weights import sum_weights
 
 DROP_ERROR = 5e-3  # largest mean absolute change of an image's colours by all Gaussians that are dropped
 MAX_OTHERS = 3  # cameras of other views that a view is rasterised at, here and in the steps of a refinement
@@ -33,6 +33,7 @@ _BASE_COST = 0.008  # cost of a merger between equal Gaussians, as a difference 
 _MERGED_SHARE = 0.5  # share of a round's pairs that is merged (docs/what_was_tried.md)
 
 
+@torch.inference_mode(False)  # contributions are gradients
 def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, "n"]:
     """Largest contribution of each Gaussian to the images of its view, in joint drawing to those of all views.
 
@@ -41,7 +42,7 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
     size = (max(size[0] // 2, 1), max(size[1] // 2, 1))  # this takes a quarter of the time; the filter conserves energy
     gaussians, poses = scene.gaussians, scene.cam2world
     largest = torch.zeros_like(gaussians.opacities)
-    area = row_weights(size[0]).to(largest)[None, :, None].expand(1, *size)
+    area = row_weights(size[0]).to(largest)[:, None].expand(size)
     area = area / (row_weights(size[0]).sum() * size[1])
     near = [nearest_views(poses, view, MAX_OTHERS) for view in range(len(poses))]
 
@@ -63,7 +64,7 @@ def measure_contributions(scene: Scene, size: tuple[int, int]) -> Float[Tensor, 
         index = chosen.nonzero()[:, 0]
         part = gaussians.select(index)
         for camera in cameras:
-            contributions = compute_blending_weights(part, camera, size).accumulate(area)[:, 0]
+            contributions = sum_weights(part, camera, area)
             largest[index] = torch.maximum(largest[index], contributions)
     return largest
 

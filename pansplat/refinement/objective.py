@@ -81,15 +81,14 @@ class Photograph:
 
 def image_difference(error: Float[Tensor, "3 height width"], weights: PixelWeights) -> Float[Tensor, ""]:
     """Mean absolute error of the colours, plus the mean of those of the gradients to the right and downwards."""
-    if error.device.type == "cpu" and error.dtype == torch.float32:
-        from pansplat.refinement.difference import Difference  # imported here, because a GPU needs no numba
-
-        return Difference.apply(error, weights.pixels, weights.right, weights.below)
-    colors = (error.abs().mean(0) * weights.pixels).sum()
-    right = error.roll(-1, 2) - error
-    below = error[:, 1:] - error[:, :-1]
-    gradients = (right.abs().mean(0) * weights.right).sum() + (below.abs().mean(0) * weights.below[:-1]).sum()
-    return colors + 0.5 * gradients
+    # A sum of absolute values is the product of the error and of the sum's gradient; this takes half the time of
+    # automatic differentiation.
+    with torch.no_grad():
+        slopes = error.sign().mul_(weights.pixels)
+        for axis, factors in ((2, weights.right), (1, weights.below)):
+            rises = error.roll(-1, axis).sub_(error).sign_().mul_(0.5 * factors)
+            slopes.sub_(rises).add_(rises.roll(1, axis))
+    return (error * slopes).sum() / len(error)
 
 
 def compare_places(

@@ -41,7 +41,7 @@ from pansplat.refinement.parameters import LEARNING_RATES, CameraParameters, Vie
 from pansplat.rendering import rasterize
 from pansplat.rendering.color_fit import fit_colors
 from pansplat.rendering.gains import equalize_gaussians, equalize_images, measure_gains
-from pansplat.rendering.weights import compute_blending_weights
+from pansplat.rendering.weights import sum_weights
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
 
@@ -255,9 +255,9 @@ class Refinement:
         if not self._seen:
             gaussians, size = self._build(layer), (self._size[0] // 2, self._size[1] // 2)  # a quarter of the pixels
             for target in layer.photographs:
-                weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), size)
-                everywhere = torch.ones(1, *size, device=gaussians.means.device)
-                self._seen.append(weights.accumulate(everywhere)[:, 0] > _MIN_SEEN_WEIGHT)
+                pose = self._cameras.pose_in_view(layer.source, target)
+                everywhere = torch.ones(size, device=gaussians.means.device)
+                self._seen.append(sum_weights(gaussians, pose, everywhere) > _MIN_SEEN_WEIGHT)
         return self._seen
 
     @torch.no_grad()
@@ -286,10 +286,10 @@ class Refinement:
         for target in layer.photographs:
             photograph = self._photographs[target]
             error = (self._draw(gaussians, layer, target) - photograph.image).abs().mean(0)
-            error = functional.interpolate((error * photograph.fitted.pixels)[None, None], half, mode="area")[0]
+            error = functional.interpolate((error * photograph.fitted.pixels)[None, None], half, mode="area")[0, 0]
             error = error * pixels * (pixels / math.prod(half))  # a sum over pixels, of weights that sum to 1
-            weights = compute_blending_weights(gaussians, self._cameras.pose_in_view(layer.source, target), half)
-            errors += weights.accumulate(error)[:, 0] / len(layer.photographs) * len(layer.views)
+            sums = sum_weights(gaussians, self._cameras.pose_in_view(layer.source, target), error)
+            errors += sums / len(layer.photographs) * len(layer.views)
         cameras = self._cameras.cam2world[:, :3, 3].to(gaussians.means)
         distances = (gaussians.means - cameras[gaussians.views.long()]).norm(dim=1)
         return errors * (gaussians.scales.amax(1) > math.pi / self._size[0] * distances)

@@ -11,7 +11,6 @@ Source: Gregor and Benson, "Computational analysis and improvement of SIRT", 200
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import torch
@@ -21,12 +20,12 @@ from torch.nn import functional
 
 from pansplat.gaussians.harmonics import SH_0, harmonics_basis
 from pansplat.gaussians.scene import Gaussians
-from pansplat.rendering.weights import BlendingWeights, compute_blending_weights
+from pansplat.rendering.weights import draw_colors
 
 _STEPS = 4  # steps for photographs of up to 1024 rows; taller ones have more
 _RELAXATION = 1.8  # factor of a step, which converges below 2
 _MIN_COVERAGE = 1e-3  # least sum of a Gaussian's weights that a step is divided by, pixels
-_STORED_PHOTOGRAPHS = 2  # photographs whose weights are kept between the steps; those of one take 200 MB at 512 rows
+_MIN_COLOR = 1e-6  # the rasteriser clamps colours below 0, which would have no gradient
 
 
 def count_steps(height: int) -> int:
@@ -36,6 +35,7 @@ def count_steps(height: int) -> int:
     return _STEPS * max(1, height // 1024)
 
 
+@torch.inference_mode(False)  # a step is a gradient
 def fit_colors(
     gaussians: Gaussians,
     images: Float[Tensor, "view 3 height width"],
@@ -74,25 +74,20 @@ def _fit(gaussians: Gaussians, photographs: Sequence[tuple[Tensor, Tensor, Tenso
         photographs: each with its pose and its mask.
     """
     change = torch.zeros_like(gaussians.harmonics[:, 0])
-
-    @functools.lru_cache(_STORED_PHOTOGRAPHS)
-    def look(number: int) -> tuple[BlendingWeights, Tensor]:
-        """The weights in a photograph, and the given colours seen from there."""
-        image, pose, _ = photographs[number]
-        weights = compute_blending_weights(gaussians, pose, (image.shape[-2], image.shape[-1]))
-        return weights, _evaluate_colors(gaussians, pose)
-
-    coverage = torch.zeros_like(change[:, :1])
-    for number, (*_, mask) in enumerate(photographs):
-        coverage += look(number)[0].accumulate(mask[None].to(change))
-    coverage.clamp_min_(_MIN_COVERAGE)
-    for _ in range(count_steps(photographs[0][0].shape[-2])):
+    coverage = torch.zeros_like(change)
+    for step in range(count_steps(photographs[0][0].shape[-2])):
         total = torch.zeros_like(change)
-        for number, (image, _, mask) in enumerate(photographs):
-            weights, colors = look(number)
-            drawn = weights.blend((colors + change).clamp_min(0))
-            total += weights.accumulate((image.to(change) - drawn) * mask.to(change))
-        change += _RELAXATION * total / coverage
+        for image, pose, mask in photographs:
+            compared = mask.to(change)
+            colors = (_evaluate_colors(gaussians, pose) + change).clamp_min(_MIN_COLOR).requires_grad_()
+            with torch.enable_grad():
+                drawn = draw_colors(gaussians, pose, colors, (image.shape[-2], image.shape[-1]))
+                covered = (drawn * compared).sum()
+                error = ((drawn - image.to(change)).square() * compared).sum()
+            if not step:
+                coverage += torch.autograd.grad(covered, colors, retain_graph=True)[0]
+            total -= 0.5 * torch.autograd.grad(error, colors)[0]
+        change += _RELAXATION * total / coverage.clamp_min(_MIN_COVERAGE)
     return gaussians.harmonics[:, 0] + change / SH_0
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pansplat.geometry import correlation
-from pansplat.geometry.correlation import correlate, correlate_positions, correlate_positions_backward
+from pansplat.geometry.correlation import correlate
 from pansplat.geometry.equirect import pixel_directions, sample_equirect, uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.geometry.warp import relative_pose, warp_panorama, warp_positions
@@ -134,13 +134,16 @@ def test_chunks_do_not_change_the_correlation(monkeypatch):
         assert torch.allclose(part, expected, atol=1e-12)
 
 
-def test_the_number_of_threads_does_not_change_the_correlations_bits(run_with_threads):
+def test_the_number_of_threads_does_not_change_the_correlations_bits(run_with_threads, monkeypatch):
     reference, other, inverse_depth, poses = (tensor.float() for tensor in _inputs(height=32))
     positions = warp_positions(inverse_depth, poses, "sphere")
+    monkeypatch.setattr(correlation, "warp_positions", lambda *_: positions)
+    reference.requires_grad_()
+    other.requires_grad_()
 
     def run():
-        forward = correlate_positions(reference, other, *positions, wraps=True)
-        return forward, *correlate_positions_backward(forward, reference, other, *positions, wraps=True)
+        forward = correlate(reference, other, inverse_depth, poses)
+        return forward, *torch.autograd.grad(forward, (reference, other), forward.detach())
 
     first, *others = run_with_threads(run)
     for threaded in others:
