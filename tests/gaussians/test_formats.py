@@ -212,6 +212,7 @@ def test_a_decoder_has_memory_in_proportion_to_the_file(tmp_path: Path, monkeypa
     head = struct.pack("<III4B", 0x5053474E, 2, 1, 0, 12, 0, 0)
     (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(1 << 27), 1))
     monkeypatch.setattr(formats, "_EXPANSION", 0)
+    monkeypatch.setattr(formats, "_FREE_BYTES", 1 << 23)
     expect_error("damaged data", load_scene, tmp_path / "a.spz")
 
 

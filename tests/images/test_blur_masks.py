@@ -149,8 +149,11 @@ def test_cube_faces_of_a_panorama_are_blurred(tmp_path: Path, color_face: Callab
     assert (views.images - plain.images).abs()[0][:, hidden].max() > 0.1
 
 
-def test_damaged_and_white_masks_are_refused(tmp_path: Path) -> None:
+def test_damaged_masks_and_those_that_hide_all_are_refused(tmp_path: Path) -> None:
     folder = _write_pair(tmp_path / "pair", 1)
+    hidden = _draw_mask(folder / "left_mask.png", np.ones_like(HIDDEN), kind="mask")
+    expect_error(r"left_mask\.png: needed some pixels", lambda: load_sets(folder)[0].load_context(HEIGHT))
+    hidden.unlink()
     mask = folder / "left_blur.png"
     Image.new("L", (128, 64), 255).save(mask)
     expect_error(r"left_blur\.png: .*white only", lambda: load_sets(folder)[0].load_context(HEIGHT))
