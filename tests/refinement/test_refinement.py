@@ -332,6 +332,8 @@ def only_card(monkeypatch: pytest.MonkeyPatch):
     """All work is that of a pretended card."""
     for part in (pipeline.prediction, pipeline.drawing):
         monkeypatch.setattr(part, "choose_device", lambda *_, **__: CARD)
+    monkeypatch.setattr(module, "_NUM_STATES", 1)
+    monkeypatch.setattr("pansplat.rendering.color_fit._STEPS", 1)
     with pretend_card() as count:
         yield count
 
