@@ -18,13 +18,6 @@ called_by_kernels = {name for kernel in kernels for name in kernel.py_func.__cod
 for kernel in kernels:
     if kernel.__name__ not in called_by_kernels and not isinstance(kernel._cache, NullCache):
         assert kernel.signatures, kernel
-import torch
-from pansplat.inputs.views import Views
-from pansplat.pipeline import predict
-poses, masks = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1), torch.ones(2, 64, 128, dtype=torch.bool)
-poses[1, 0, 3] = 0.2
-views = Views(torch.rand(2, 3, 64, 128), poses, masks, near=0.1, far=10.0, names=("left", "right"))
-predict(views, "sweep", refine_steps=2, joint=False)
 assert not [name for name in sys.modules if name.startswith(("pansplat.model", "torch._dynamo", "sympy"))]
 """
 
