@@ -202,7 +202,7 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
     monkeypatch.setattr("pansplat.poses.estimate._is_mirrored", lambda *_: False)
     monkeypatch.setattr("pansplat.poses.estimate.polish_relative_pose", lambda relation, *_: relation)
     monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
-    monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
+    monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_, **__: MagicMock())
     links = {pair: NO_LINKS for pair in itertools.combinations(range(11), 2)}
     relations = _relate_views(views, links, MagicMock(), Store(None))
     home = {pair for pair in relations if pair[1] < 8}
