@@ -18,7 +18,7 @@ from torch import Tensor
 from pansplat.export.photographs import list_photographs, load_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
-from pansplat.geometry.path import level_axes
+from pansplat.geometry.level import level_axes
 from pansplat.images.panorama_metadata import Stereo
 from pansplat.images.video import write_video
 from pansplat.inputs.panorama_sets import PanoramaSet

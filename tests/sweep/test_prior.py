@@ -5,9 +5,9 @@ import pytest
 
 from pansplat.sweep import search as search_module
 from pansplat.sweep.matching import View
+from pansplat.sweep.panoramas import ray_grid, resize_sphere, upright_rotation
 from pansplat.sweep.prior import DepthPrior, PriorEstimator
 from pansplat.sweep.search import SearchConfig, observe, search
-from pansplat.sweep.surface import ray_grid, resize_sphere, upright_rotation
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))

@@ -33,7 +33,7 @@ from pansplat.export.page import PageFiles, write_page
 from pansplat.export.page_server import PageServer
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
-from pansplat.geometry.path import turn_axes
+from pansplat.geometry.level import turn_axes
 from pansplat.geometry.world import WorldFrame
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.panorama_sets import Note, PanoramaSet
