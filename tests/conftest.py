@@ -23,6 +23,9 @@ from jaxtyping import config, install_import_hook
 from panorama_formats import write_posed
 from torch import Tensor
 
+from pansplat.system.allocator import keep_freed_memory
+
+keep_freed_memory()  # as the commands
 # One thread per pytest-xdist worker and its child processes: workers must not compete for cores.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"

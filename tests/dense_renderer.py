@@ -210,12 +210,15 @@ def find_gradients(render: Renderer, scene: Gaussians, pose: Tensor | None = Non
     return {**{name: getattr(fields, name).grad for name in FIELDS}, "pose": camera.grad}
 
 
-def assert_dense(render: Renderer, scene: Gaussians, options: dict[str, Any]) -> tuple[list, list]:
+def assert_dense(
+    render: Renderer, scene: Gaussians, options: dict[str, Any], truths: dict | None = None
+) -> tuple[list, list]:
     """Assert that a backend's image, counts and gradients equal those of the dense renderer; returns both.
 
     Args:
         options: of `rasterize`; and `pose`; `slack`, by which the case is worse conditioned; `fields`, whose gradients
             are compared; and `metre`, the unit of length.
+        truths: results of the dense renderer for this scene and these options, by type and size; a new one is added.
     """
     options = {"size": render.size, **options}
     chosen = {name: options.pop(name, None) for name in ("pose", "slack", "fields", "metre")}
@@ -235,32 +238,34 @@ def assert_dense(render: Renderer, scene: Gaussians, options: dict[str, Any]) ->
         color = color + (1 - alpha) * ground[:, None, None]
         return Rendering(color, alpha, depth), (close == 0).detach()
 
-    def draw(given: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, None]:
-        return render(given, camera, background=ground, **options), None
+    def draw(given: Gaussians, camera: Tensor, ground: Tensor) -> tuple[Rendering, Tensor]:
+        return render(given, camera, background=ground, **options), shown
 
-    images, gradients, shown = [], [], None
-    for function, given in ((draw_truth, rounded.to(dtype=torch.float64)), (draw, rounded)):
+    def differentiate(function: Any, given: Gaussians) -> tuple[Rendering, dict[str, Tensor], Tensor]:
         inputs, camera, ground = make_leaves(given), pose.clone().requires_grad_(), background.clone().requires_grad_()
         image, mask = function(inputs, camera, ground)
-        shown = mask if shown is None else shown
-        measure_loss(image, shown).backward()
-        images.append(image)
+        measure_loss(image, mask).backward()
         leaves = {name: getattr(inputs, name) for name in FIELDS} | {"pose": camera, "background": ground}
         found = {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
         turn = pose[:3, :3].T @ found["pose"][:3, :3]  # both formulas agree along rigid motions only
         found["pose"] = torch.cat((turn - turn.T, metre * found["pose"][:3, 3:]), dim=1)
-        gradients.append(found)
-    truth, got = images
+        return Rendering(image.color.detach(), image.alpha.detach(), image.depth.detach()), found, mask
+
+    truths, key = {} if truths is None else truths, (render.dtype, options["size"])
+    if key not in truths:
+        truths[key] = differentiate(draw_truth, rounded.to(dtype=torch.float64))
+    truth, expected_gradients, shown = truths[key]
+    got, gradients, _ = differentiate(draw, rounded)
     assert shown.double().mean() > 0.8, "most pixels are not at a cut"
-    for name, weight in (("color", 1.0), ("alpha", 1.0), ("depth", truth.alpha.detach() / metre)):
-        error = (getattr(got, name) - getattr(truth, name)).detach() * weight * shown
-        size = max(1.0, float((getattr(truth, name).detach() * weight).abs().max()))
+    for name, weight in (("color", 1.0), ("alpha", 1.0), ("depth", truth.alpha / metre)):
+        error = (getattr(got, name) - getattr(truth, name)) * weight * shown
+        size = max(1.0, float((getattr(truth, name) * weight).abs().max()))
         assert float(error.abs().max()) <= slack * render.image * size, f"{name} off by {float(error.abs().max()):.2g}"
     for name in chosen["fields"] or (*NO_QUATS, "quats"):
-        expected, found = gradients[0][name].double(), gradients[1][name].double()
+        expected, found = expected_gradients[name].double(), gradients[name].double()
         assert torch.isfinite(found).all(), name
         unit = metre if name in ("means", "scales") else 1.0
         norm = max(unit * float(expected.norm()), 1e-6)  # a sphere's quaternion has only rounding errors as gradient
         error = unit * float((found - expected).norm()) / norm
         assert error <= slack * render.gradient, f"gradient of {name} off by {error:.2g}"
-    return images, gradients
+    return [truth, got], [expected_gradients, gradients]

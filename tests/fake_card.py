@@ -9,7 +9,6 @@ from unittest import mock
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map_only
 
 CARD = torch.device("meta")  # torch's functions accept it on every machine
 _TENSOR, _AUTOCAST = torch.tensor, torch.autocast
@@ -60,9 +59,12 @@ class _Card(TorchDispatchMode):
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
-        tensors = [value for value in tree_flatten((args, kwargs))[0] if isinstance(value, Tensor)]
+        values = (*args, *kwargs.values())
+        tensors = [v for value in values for v in _list_parts(value) if isinstance(v, Tensor)]
         on_card = [isinstance(value, _CardTensor) for value in tensors]
         target = kwargs.get("device")
+        if target is None and not any(on_card):
+            return function(*args, **kwargs)
         if target is not None:
             kwargs["device"] = torch.device("cpu")
         to_card = any(on_card) if target is None else torch.device(target) == CARD
@@ -72,15 +74,26 @@ class _Card(TorchDispatchMode):
         elif any(on_card) and any(value.ndim and not card for value, card in zip(tensors, on_card, strict=True)):
             self.count["copies" if name.startswith("aten::index") else f"mixed in {name}"] += 1
         self.count["reads"] += any(on_card) and name in _READS
-        args, kwargs = tree_map_only(_CardTensor, lambda value: value.inner, (args, kwargs))
-        got = function(*args, **kwargs)
-        return got if not to_card else _wrap(got, tensors)
+        got = function(*map(_unwrap, args), **{key: _unwrap(value) for key, value in kwargs.items()})
+        known = {id(value.inner): value for value in tensors if isinstance(value, _CardTensor)}
+        return _wrap(got, known) if to_card else got
 
 
-def _wrap(got: Any, tensors: list[Tensor]) -> Any:
+def _list_parts(value: Any) -> Any:
+    return value if isinstance(value, (list, tuple)) else (value,)
+
+
+def _unwrap(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return [_unwrap(part) for part in value]
+    return value.inner if isinstance(value, _CardTensor) else value
+
+
+def _wrap(got: Any, known: dict[int, Tensor]) -> Any:
     """Results on the card; one that is an argument is that argument."""
-    known = {id(value.inner): value for value in tensors if isinstance(value, _CardTensor)}
-    return tree_map_only(Tensor, lambda value: known[id(value)] if id(value) in known else _CardTensor(value), got)
+    if isinstance(got, (list, tuple)):
+        return type(got)([_wrap(part, known) for part in got])
+    return (known[id(got)] if id(got) in known else _CardTensor(got)) if isinstance(got, Tensor) else got
 
 
 @contextmanager

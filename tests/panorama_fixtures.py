@@ -15,21 +15,25 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.images.image_files import write_image
 
 
+def write_grey(path: Path, value: float = 0.5) -> None:
+    """Write a grey panorama of 16x32 pixels, with its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, torch.full((3, 16, 32), value))
+
+
+def write_depth_image(path: Path, millimetres: int) -> None:
+    """Write a depth image of 16x32 pixels."""
+    cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
+
+
 @pytest.fixture(scope="session")
 def write_panorama() -> Callable[..., None]:
-    """Write a grey panorama of 16x32 pixels, with its folder."""
-
-    def write(path: Path, value: float = 0.5) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, torch.full((3, 16, 32), value))
-
-    return write
+    return write_grey
 
 
 @pytest.fixture(scope="session")
 def write_depth() -> Callable[..., None]:
-    """Write a depth image of 16x32 pixels."""
-    return lambda path, millimetres: cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
+    return write_depth_image
 
 
 @pytest.fixture(scope="session")

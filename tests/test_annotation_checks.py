@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from annotation_checks import check_types, restart_checks
-from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
@@ -25,13 +24,3 @@ def test_the_first_calls_after_a_restart_are_checked() -> None:
             _transpose(torch.zeros(2, 2))
         assert _transpose(torch.zeros(2, 3)).shape == (2, 3)  # later calls are not
         restart_checks()
-
-
-def test_an_int_is_a_float_and_a_string_is_none() -> None:
-    @check_types
-    def half(number: float) -> float:
-        return number / 2
-
-    assert half(3) == 1.5
-    with pytest.raises(BeartypeCallHintViolation, match="float"):
-        half("3")  # pyright: ignore[reportArgumentType]

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,9 +66,7 @@ def add_mask(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [change_one_pixel, change_pose, change_far, add_mask])
-def test_any_change_of_the_pair_causes_a_new_prediction(
-    pair_folder: Path, change: Callable[[Path], None], sphere_predictor
-) -> None:
+def test_any_change_of_the_pair_causes_a_new_prediction(pair_folder, change, sphere_predictor) -> None:
     predictor = sphere_predictor()
     predict(pair_folder, predictor, height=HEIGHT)
     change(pair_folder)
@@ -103,9 +100,7 @@ def gray_pair(pair_folder: Path) -> Path:
 
 
 @pytest.mark.usefixtures("any_state")
-def test_a_refined_scene_is_cached_apart_from_its_prediction(
-    gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refined_scene_is_cached_apart_from_its_prediction(gray_pair, sphere_predictor, monkeypatch) -> None:
     predictor, shown = sphere_predictor(), []
     first = predict(gray_pair, predictor, height=HEIGHT, refine_steps=8, on_predicted=shown.append)
     again = predict(gray_pair, predictor, height=HEIGHT, refine_steps=8, on_predicted=shown.append)
@@ -118,9 +113,7 @@ def test_a_refined_scene_is_cached_apart_from_its_prediction(
 
 
 @pytest.mark.usefixtures("any_state")
-def test_a_refinement_is_the_same_however_busy_the_machine_is(
-    gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refinement_is_the_same_however_busy_the_machine_is(gray_pair, sphere_predictor, monkeypatch) -> None:
     scenes = []
     for delay in (0.0, 100.0):  # seconds between two readings of the clock
         ticks = itertools.count(step=delay)
@@ -168,9 +161,7 @@ def test_one_content_has_one_entry_whatever_names_and_paths_are(pair_folder: Pat
 
 
 @pytest.mark.usefixtures("any_state")
-def test_a_cached_scene_is_opened_without_its_photographs(
-    gray_pair: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cached_scene_is_opened_without_its_photographs(gray_pair, sphere_predictor, monkeypatch) -> None:
     first = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_steps=s) for s in (0, 8)]
     monkeypatch.setattr(PanoramaSet, "load_context", lambda *_: pytest.fail("it is decoded"))
     again = [predict(gray_pair, sphere_predictor(), height=HEIGHT, refine_steps=s) for s in (0, 8)]
@@ -180,9 +171,7 @@ def test_a_cached_scene_is_opened_without_its_photographs(
         assert all(getattr(before, name) == getattr(after, name) for name in fields)
 
 
-def test_a_photograph_that_changes_during_its_prediction_leaves_no_entry(
-    pair_folder: Path, sphere_predictor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photograph_that_changes_during_its_prediction_leaves_no_entry(pair_folder, sphere_predictor, monkeypatch):
     predict_sphere = sphere_predictor.__call__
 
     def change(*arguments: Any, **named: Any) -> Any:

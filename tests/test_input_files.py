@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from input_files import DOCUMENTS, EYE, FILES, IN_PART, InputFile
+from input_files import DOCUMENTS, FILES, IN_PART, InputFile
 
 from pansplat.errors import InputError
 
@@ -61,7 +59,7 @@ def flip(data: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
-@pytest.mark.parametrize("count", [50, pytest.param(2000, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("count", [15, pytest.param(2000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("name", FILES)
 def test_a_damaged_file_is_read_or_named(name: str, count: int, tmp_path: Path) -> None:
     file, rng = FILES[name](tmp_path), random.Random(name)
@@ -134,34 +132,10 @@ def require_named(keys: tuple[Any, ...], message: str) -> None:
 def test_any_other_value_is_read_or_its_field_is_named(name: str, tmp_path: Path) -> None:
     file, rng, refused = FILES[name](tmp_path), random.Random(name), 0
     parts = list(list_parts(file.document))
-    for keys in rng.sample(parts, min(len(parts), 120)):
+    for keys in rng.sample(parts, min(len(parts), 40)):
         for value in ({"odd": []}, "odd", *rng.sample(VALUES, 3)):
             message = attempt(file, file.pack(change(file.document, keys, value)))
             refused += message is not None
             if message is not None and not (message.startswith(IN_PART) and is_named(file, message)):
                 require_named(keys, message)
     assert refused > 5
-
-
-_SCALARS = (
-    *(10**400, 1e300, 1e-300, -1, 0, 0.45, "../x", "http://x", "a", "a.png", "b.png", "cubemap", "multires", "%s"),
-    *("{row}", "", "\ud800", "cam2world opencv", [[1.0, 0, 0, 0]] * 4, EYE),
-)
-_NAMES = ("convention", "poses", "near", "far", "a.png", "b.png", "pairs", "context", "target", "cam2world")
-_KEYS = st.text(max_size=4) | st.sampled_from(_NAMES)
-_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4) | st.sampled_from(_SCALARS),
-    lambda inner: st.lists(inner, max_size=6) | st.dictionaries(_KEYS, inner, max_size=4),
-    max_leaves=12,
-)
-
-
-@pytest.mark.parametrize("name", DOCUMENTS)
-@settings(max_examples=15, suppress_health_check=list(HealthCheck))
-@given(value=_JSON, seed=st.integers(0, 10**6))
-def test_any_value_is_read_or_the_file_is_named(tmp_path: Path, name: str, value: Any, seed: int) -> None:
-    folder = tmp_path / str(len(list(tmp_path.iterdir())))
-    folder.mkdir()
-    file = FILES[name](folder)
-    keys = random.Random(seed).choice([(), *list_parts(file.document)])
-    attempt(file, file.pack(change(file.document, keys, value)))

@@ -150,9 +150,7 @@ def test_show_displays_the_frame_in_a_notebook(scene: Scene, cell: Output) -> No
     assert cell.options == {"raw": True}
 
 
-def test_calls_show_one_bar_in_a_notebook_and_remove_it(
-    cell: Output, sphere_predictor: type, pair_folder: Path
-) -> None:
+def test_calls_show_one_bar_in_a_notebook_and_remove_it(cell, sphere_predictor, pair_folder) -> None:
     class Slow(sphere_predictor):
         def __call__(self, images: Tensor, *rest: object, **options: object) -> Gaussians:
             report_progress("placing Gaussians", 0.5)

@@ -79,9 +79,7 @@ def test_a_single_view_has_the_scale_of_its_camera_height(tmp_path: Path, sphere
     expect_error("camera_height", load_sets, photograph, camera_height=0.0)
 
 
-def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_camera_height(
-    tmp_path: Path, write_pair
-) -> None:
+def test_photographs_that_are_shown_before_their_poses_are_estimated_have_the_camera_height(tmp_path, write_pair):
     folder = write_pair(tmp_path / "pair")
     (folder / "poses.json").unlink()
     shown: list[PanoramaSet] = []
@@ -188,9 +186,7 @@ def test_in_a_tour_the_views_of_the_nearest_edge_are_blended_and_others_fill_the
 
 
 @pytest.mark.parametrize("blending", ["deferred", "joint"])
-def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(
-    tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor, blending: str
-) -> None:
+def test_in_a_tour_of_parts_only_the_part_of_the_camera_is_drawn(tmp_path, write_tour, sphere_predictor, blending):
     pairs = load_sets(write_tour(tmp_path / "house", 3))
     alone = replace(pairs[1].context[1], world=1)
     (tour,) = find_tours([pairs[0], replace(pairs[1], context=(alone,))])
@@ -238,17 +234,10 @@ def test_original_drawing_uses_the_official_kernel_stitching_and_harmonics(scene
     assert not torch.allclose(rendered, render(scene, pose, blend="joint", size=(32, 64)).color, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"drawing": "fast"}, {"drawing": "original", "kernel": "ray"}, {"drawing": "original", "layout": "pinhole"}],
-)
-def test_render_refuses_conflicting_drawing_options(scene: Scene, options: dict[str, Any], unchecked: None) -> None:
-    expect_error("`drawing`|sets all", lambda: render(scene, scene.pose_between(0.5), size=(32, 64), **options))
-
-
-@pytest.mark.parametrize("blend", [2, -1, "view0", "mixed"])
-def test_render_refuses_an_unknown_blend(scene: Scene, blend: str | int) -> None:
-    expect_error("`blend` must be", lambda: render(scene, scene.pose_between(0.5), blend=blend))
+def test_render_refuses_an_unknown_blend_and_conflicting_drawing_options(scene: Scene, unchecked: None) -> None:
+    conflicts = [{"drawing": "original", "kernel": "ray"}, {"drawing": "original", "layout": "pinhole"}]
+    for options in ({"drawing": "fast"}, *conflicts, *({"blend": value} for value in (2, -1, "view0", "mixed"))):
+        expect_error("`drawing`|sets all|`blend` must be", render, scene, scene.pose_between(0.5), **options)
 
 
 def test_a_saved_scene_renders_the_same_image(scene: Scene, tmp_path: Path) -> None:
@@ -258,9 +247,6 @@ def test_a_saved_scene_renders_the_same_image(scene: Scene, tmp_path: Path) -> N
     before, after = render(scene, pose), render(back, pose)
     torch.testing.assert_close(after.color, before.color, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.depth, before.depth, atol=1e-4, rtol=0)
-
-
-# Predictions into a file, tile by tile
 
 
 TILED_HEIGHT = 64
@@ -311,9 +297,7 @@ def test_predict_to_file_writes_the_gaussians_of_predict(masked_pair: Path, weig
     assert all(getattr(tiles, name) == getattr(whole, name) for name in ("near", "far", "names", "model", "height"))
 
 
-def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(
-    tmp_path: Path, write_pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(tmp_path, write_pair, monkeypatch) -> None:
     (pair,) = load_sets(write_pair(tmp_path / "pair", height=64))
     for height, rows in ((16, 32), (48, 64), (64, 64)):
         assert pipeline.load_photographs(pair, height).images.shape[-2] == rows
@@ -323,9 +307,7 @@ def test_photographs_for_a_refinement_have_twice_the_rows_if_the_files_do(
 
 
 @pytest.mark.slow
-def test_the_predict_command_streams_large_predictions(
-    masked_pair: Path, weights: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_the_predict_command_streams_large_predictions(masked_pair, weights, tmp_path, monkeypatch, capsys) -> None:
     command = ["predict", str(masked_pair), "--model", str(weights), "--height", str(TILED_HEIGHT), "--degree", "0"]
     monkeypatch.setattr(pipeline.calls, "predict_set", None)  # must not be called
     assert run([*command, "-o", str(tmp_path / "tiles.ply")]) == 0
@@ -337,9 +319,7 @@ def test_the_predict_command_streams_large_predictions(
     np.testing.assert_allclose(_sorted_columns(tiles), _sorted_columns(whole), atol=1e-5)
 
 
-def test_predictions_are_written_in_the_format_of_the_suffix(
-    pair_folder: Path, tmp_path: Path, sphere_predictor: type
-) -> None:
+def test_predictions_are_written_in_the_format_of_the_suffix(pair_folder, tmp_path, sphere_predictor) -> None:
     predictor = sphere_predictor()
     scene = predict(pair_folder, predictor, cache=False)
     assert predict_to_file(pair_folder, tmp_path / "a.splat", predictor) == len(scene.gaussians)
@@ -348,9 +328,7 @@ def test_predictions_are_written_in_the_format_of_the_suffix(
     assert predictor.calls == 2, "a wrong suffix is refused before the work"
 
 
-def test_the_scene_of_a_tour_holds_each_panorama_once(
-    tmp_path: Path, write_tour: Callable[..., Path], sphere_predictor: type
-) -> None:
+def test_the_scene_of_a_tour_holds_each_panorama_once(tmp_path, write_tour, sphere_predictor) -> None:
     (tour,) = find_tours(load_sets(write_tour(tmp_path / "house", 4)))
     predictor = sphere_predictor()
     scene = predict(tour, predictor, cache=False)
@@ -449,9 +427,7 @@ def predict_room(room: Callable[[str], Path]) -> Callable[..., Scene]:
 
 
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
-def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
-    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene]
-) -> None:
+def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(name, room, predict_room) -> None:
     unit, origin = FRAMES[name]
     # An origin of the working world is a multiple of 64 m; that of the poses is not.
     expected, scene = predict_room("metres", *((0.0, 32.0, 16.0) if origin else ())), predict_room(name)
@@ -466,9 +442,7 @@ def test_a_room_in_any_frame_is_that_in_metres_moved_to_the_working_world(
 
 
 @pytest.mark.parametrize("name", [name for name in FRAMES if name != "metres"])
-def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
-    name: str, room: Callable[[str], Path], predict_room: Callable[..., Scene], tmp_path: Path
-) -> None:
+def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(name, room, predict_room, tmp_path) -> None:
     folder, size, unit, scene = room(name), (64, 128), FRAMES[name][0], predict_room(name)
     ours = render(scene, scene.cam2world[0], size=size).color
     pose = json.loads((folder / "poses.json").read_text())["poses"]["left.jpg"]["cam2world"]
@@ -490,9 +464,7 @@ def test_a_scene_file_is_drawn_at_poses_of_the_users_frame(
     assert float((drawn - ours.clamp(0, 1)).square().mean()) < 1e-4
 
 
-def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(
-    room: Callable[[str], Path], predict_room: Callable[..., Scene]
-) -> None:
+def test_a_scene_file_is_refined_with_photographs_whose_frame_has_another_origin(room, predict_room) -> None:
     views, scene = load_sets(room("UTM"))[0].load_context(64), predict_room("UTM")
     x, y, z = scene.frame.origin
     frame = replace(scene.frame, origin=(x - 512.0, y, z))

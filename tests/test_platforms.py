@@ -23,9 +23,6 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
 
 
-# Names
-
-
 @pytest.mark.parametrize(
     ("name", "portable"),
     [
@@ -57,9 +54,6 @@ def test_a_drive_that_does_not_exist_ends_no_search(monkeypatch: pytest.MonkeyPa
     expect_error("needed an existing drive", lambda: require_output_folder("--out", Path("/nowhere/at/all")))
 
 
-# Files that are in use
-
-
 def test_weights_keep_no_hold_of_their_file(tmp_path: Path, small_config: object) -> None:
     path, numbers = tmp_path / "model.safetensors", torch.arange(1 << 16).float()
     save_weights(path, pack_weights("pansplat", small_config, {"weight": numbers}, compat="fixed"))
@@ -71,21 +65,13 @@ def test_weights_keep_no_hold_of_their_file(tmp_path: Path, small_config: object
     assert torch.equal(tensors["weight"], numbers)
 
 
-# Processes
-
-
 def test_a_crash_without_a_message_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(formats, "_CODER", "import os; os._exit(5)")
     with pytest.raises(formats._CoderError, match="gaussforge stopped, 0x5"):
         formats._convert(b"", "ply", "spz")
 
 
-# Consoles
-
-
-def test_a_closed_pipe_ends_a_command_quietly_on_windows(
-    windows: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_closed_pipe_ends_a_command_quietly_on_windows(windows, monkeypatch, capsys) -> None:
     monkeypatch.setattr(console, "_discard_output", lambda _: None)
 
     def write() -> int:
@@ -96,13 +82,7 @@ def test_a_closed_pipe_ends_a_command_quietly_on_windows(
 
 
 @pytest.mark.parametrize(("variables", "has_color"), [({}, False), ({"WT_SESSION": "1"}, True), ({"TERM": "x"}, True)])
-def test_the_classic_console_of_windows_gets_no_escape_codes(
-    windows: None,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    variables: dict[str, str],
-    has_color: bool,
-) -> None:
+def test_the_classic_console_of_windows_gets_no_escape_codes(windows, monkeypatch, capsys, variables, has_color):
     for name in ("WT_SESSION", "TERM", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
@@ -111,8 +91,6 @@ def test_the_classic_console_of_windows_gets_no_escape_codes(
     console.print_message("error", "text")
     assert ("\x1b" in capsys.readouterr().err) == has_color
 
-
-# Sorting
 
 _WITHOUT_TIES = {"np.argsort(order)", "np.argsort(placed)", "torch.argsort(torch.cat(places))"}  # permutations
 

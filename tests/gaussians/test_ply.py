@@ -189,18 +189,3 @@ def test_non_finite_gaussians_of_parts_are_left_out_with_one_warning(tmp_path: P
     kept = torch.ones(60, dtype=torch.bool)
     kept[[3, 50]] = False
     assert torch.equal(load_ply(tmp_path / "a.ply").gaussians.means, means[kept])
-
-
-def test_an_interrupted_save_leaves_the_old_file(tmp_path: Path, scene: Scene, make_scene) -> None:
-    (tmp_path / "a.ply").write_text("before")
-
-    def parts() -> Iterator[Gaussians]:
-        yield scene.gaussians
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        save_ply_parts(scene, parts(), tmp_path / "a.ply")
-    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.ply", "before")]
-    with pytest.raises(ValueError, match="9 harmonics each, got 4"):
-        save_ply_parts(scene, [scene.gaussians, make_scene(60, 1).gaussians], tmp_path / "a.ply")
-    expect_error("needed an existing folder", save_ply_parts, scene, [scene.gaussians], tmp_path / "none" / "a.ply")

@@ -10,27 +10,14 @@ from pansplat.gaussians.scene import Gaussians, Scene, prune
 from pansplat.geometry.pose import rotations_from_quats
 
 
-def _make(n: int, k: int = 4, seed: int = 0) -> Gaussians:
-    rng = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=rng),
-        scales=torch.rand(n, 3, generator=rng) + 0.1,
-        quats=torch.randn(n, 4, generator=rng),
-        opacities=torch.rand(n, generator=rng),
-        harmonics=torch.randn(n, k, 3, generator=rng),
-        levels=torch.arange(n) % 4,
-        views=torch.arange(n) % 2,
-    )
-
-
-def test_covariances_have_the_squared_scales_as_eigenvalues():
-    gaussians = _make(20).to(dtype=torch.float64)
+def test_covariances_have_the_squared_scales_as_eigenvalues(make_scene):
+    gaussians = make_scene(20).gaussians.to(dtype=torch.float64)
     eigenvalues = torch.linalg.eigvalsh(gaussians.covariances)
     assert torch.allclose(eigenvalues, (gaussians.scales**2).sort(dim=1).values)
 
 
-def test_wrong_shapes_are_refused_with_the_name(unchecked):
-    good = _make(3)
+def test_wrong_shapes_are_refused_with_the_name(unchecked, make_scene):
+    good = make_scene(3).gaussians
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
     with pytest.raises(ValueError, match=r"`scales` must have shape \(3, 3\).*got \(2, 3\)"):
         Gaussians(**{**fields, "scales": good.scales[:2]})
@@ -38,20 +25,20 @@ def test_wrong_shapes_are_refused_with_the_name(unchecked):
         Gaussians(**{**fields, "harmonics": torch.zeros(3, 5, 3)})
 
 
-def test_joining_appends_sets_of_one_degree():
-    a, b = _make(3), _make(4, seed=1)
+def test_joining_appends_sets_of_one_degree(make_scene):
+    a, b = make_scene(3).gaussians, make_scene(4, seed=1).gaussians
     joined = Gaussians.cat([a, b])
     assert len(joined) == 7 and torch.equal(joined.quats[3:], b.quats)
     with pytest.raises(ValueError, match=r"one SH degree, got \[0, 1\]"):
-        Gaussians.cat([a, _make(2, 1)])
+        Gaussians.cat([a, make_scene(2, 0).gaussians])
     with pytest.raises(ValueError, match="at least one"):
         Gaussians.cat([])
 
 
 @pytest.fixture
-def translucent() -> Gaussians:
+def translucent(make_scene) -> Gaussians:
     """Degree 4, with opacities in increasing order."""
-    return dataclasses.replace(_make(50, 25), opacities=torch.linspace(0, 1, 50))
+    return dataclasses.replace(make_scene(50, 4).gaussians, opacities=torch.linspace(0, 1, 50))
 
 
 def test_pruning_keeps_the_opaque_gaussians(translucent):
@@ -69,16 +56,16 @@ def test_pruning_to_a_degree_keeps_the_lower_coefficients(translucent):
     assert prune(prune(translucent, degree=1), degree=3).degree == 1
 
 
-def test_pose_between_starts_and_ends_at_the_cameras():
+def test_pose_between_starts_and_ends_at_the_cameras(make_scene):
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, :3, 3] = torch.tensor((1 / 3, -2e-7, 12345.678901234567))
-    scene = Scene(_make(2), poses, near=0.5, far=8.0)
+    scene = Scene(make_scene(2).gaussians, poses, near=0.5, far=8.0)
     assert torch.allclose(scene.pose_between(0.0), poses[0]) and torch.allclose(scene.pose_between(1.0), poses[1])
     assert torch.allclose(scene.pose_between(0.5)[:3, 3], poses[:, :3, 3].mean(dim=0))
 
 
-def test_a_rotation_turns_shapes_and_colours_with_the_world():
-    gaussians = _make(5, 9).to(dtype=torch.float64)
+def test_a_rotation_turns_shapes_and_colours_with_the_world(make_scene):
+    gaussians = make_scene(5, 2).gaussians.to(dtype=torch.float64)
     turn = rotations_from_quats(torch.tensor([0.5, -0.1, 0.7, 0.3], dtype=torch.float64))
     poses = torch.eye(4, dtype=torch.float64)[None]
     turned = Scene(gaussians, poses, 0.1, 10.0).rotated(turn)

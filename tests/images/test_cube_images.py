@@ -24,9 +24,7 @@ def cube(tmp_path: Path, write_tiles) -> CubeImage:
 
 
 @pytest.mark.parametrize(("size", "height"), [(64, 128), (256, 64), (20, 33), (16, 90), (9, 4)])
-def test_a_panorama_of_faces_shows_every_direction_at_its_place(
-    size: int, height: int, color_face, check_colors
-) -> None:
+def test_a_panorama_of_faces_shows_every_direction_at_its_place(size, height, color_face, check_colors) -> None:
     panorama = equirect_from_faces([color_face(face, size) for face in "frblud"], height)
     assert panorama.shape == (height, 2 * height, 3)
     check_colors(torch.from_numpy(panorama).permute(2, 0, 1) / 255, tolerance=3 if height > 4 else 15)

@@ -36,19 +36,6 @@ def test_odd_sizes_lose_a_row_or_column_and_films_are_h264(tmp_path: Path) -> No
         assert (stream.width, stream.height, video_encoder()) == (64, 32, "libx264")
 
 
-def test_a_failing_source_keeps_the_old_file(tmp_path: Path) -> None:
-    def failing() -> Iterator[np.ndarray]:
-        yield from _frames(100)  # more than the encoder keeps back
-        raise RuntimeError("no more frames")
-
-    write_video(tmp_path / "a.mp4", _frames(2), 30)
-    before = (tmp_path / "a.mp4").read_bytes()
-    with pytest.raises(RuntimeError, match="no more frames"):
-        write_video(tmp_path / "a.mp4", failing(), 30)
-    assert (tmp_path / "a.mp4").read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
-
-
 @pytest.mark.parametrize(
     ("name", "frames", "fps", "message"),
     [

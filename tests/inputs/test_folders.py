@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from panorama_fixtures import write_depth_image, write_grey
 from refusals import expect_error
 
 from pansplat.errors import InputError
@@ -23,19 +24,10 @@ def _pose(x: float, z: float = 0.0) -> list[list[float]]:
     return [[0, 0, 1, x], [0, 1, 0, 0], [-1, 0, 0, z], [0, 0, 0, 1]]
 
 
-def _write_panorama(path: Path, value: float = 0.5) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_image(path, torch.full((3, 16, 32), value))
-
-
-def _write_depth(path: Path, millimetres: int) -> None:
-    cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
-
-
 def _folder(folder: Path, names: Sequence[str] = ("left.png", "right.png"), **content: object) -> Path:
     """A pair folder whose i-th camera is at x = i; `content` goes into poses.json, None removes an entry."""
     for i, name in enumerate(names):
-        _write_panorama(folder / name, 0.1 * (i + 1))
+        write_grey(folder / name, 0.1 * (i + 1))
     poses = {"convention": OPENCV, "poses": {name: _pose(i) for i, name in enumerate(names)}} | content
     (folder / "poses.json").write_text(json.dumps({k: v for k, v in poses.items() if v is not None}))
     return folder
@@ -91,7 +83,7 @@ def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
     entries["left.png"]["mask"] = "own.png"
     folder = _folder(tmp_path / "room", names, poses=entries, near=0.2, far=30)
     for i, name in enumerate(names):
-        _write_depth(folder / f"{name[:-4]}_far.png", 1000 * (i + 1))
+        write_depth_image(folder / f"{name[:-4]}_far.png", 1000 * (i + 1))
     mask = np.full((16, 32), 255, np.uint8)
     mask[8:] = 0
     cv2.imwrite(str(folder / "own.png"), mask)
@@ -105,19 +97,6 @@ def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
     assert not views.masks[0, 8:].any()
     assert views.masks[0, :8].all()
     assert views.masks[1].all()
-
-
-def test_mask_files_are_found_by_name_and_must_show_some_scene(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "room")
-    whole, own = torch.ones(3, 16, 32), torch.ones(3, 16, 32)
-    whole[:, :, :4], own[:, :, 20:] = 0, 0
-    write_image(folder / "mask.png", whole)
-    write_image(folder / "left_mask.png", own)
-    masks = load_sets(folder)[0].load_context(16).masks
-    assert torch.equal(masks[0], own[0] > 0)
-    assert torch.equal(masks[1], whole[0] > 0)
-    write_image(folder / "right_mask.png", torch.zeros(3, 16, 32))
-    expect_error(r"right_mask\.png: needed", lambda: load_sets(folder)[0].load_context(16))
 
 
 def test_near_and_far_arguments_override_the_file(tmp_path: Path) -> None:
@@ -164,8 +143,8 @@ def test_triplets_come_first_and_contexts_are_unique(tmp_path: Path) -> None:
 def _matterport3d(scene: Path) -> Path:
     for i in range(3):
         view = scene / f"{i:02d}"
-        _write_panorama(view / "rgb.png")
-        _write_depth(view / "depth.png", 2500)
+        write_grey(view / "rgb.png")
+        write_depth_image(view / "depth.png", 2500)
         np.savetxt(view / "rot.txt", np.eye(3))
         np.savetxt(view / "tran.txt", [0, 0.5, 0.5 * (i - 1)])
     return scene
@@ -185,21 +164,10 @@ def test_panogrf_scenes_are_found_from_every_level_of_folders(tmp_path: Path) ->
     assert views.cam2world[0].tolist() == [[1, 0, 0, 0], [0, 0, 1, 0.5], [0, -1, 0, 0.5], [0, 0, 0, 1]]
 
 
-def test_game_map_triplets_are_read(tmp_path: Path) -> None:
-    for i in range(3):
-        _write_panorama(tmp_path / f"map_0_{i}.png")
-        _write_depth(tmp_path / f"map_0_{i}_depth.png", 1000)
-    (tmp_path / "map_0.json").write_text(json.dumps({"c2w": [_pose(0), _pose(1), _pose(3)]}))
-    (pair,) = load_sets(tmp_path)
-    assert pair.name == "map_0"
-    assert _centres(pair) == [0, 3]
-    assert [target.name for target in pair.targets] == ["map_0_1"]
-
-
 def _sequence(folder: Path, count: int = 3) -> list[str]:
     names = [f"{i:04d}.png" for i in range(count)]
     for name in names:
-        _write_panorama(folder / "image" / name)
+        write_grey(folder / "image" / name)
     return names
 
 
@@ -231,7 +199,7 @@ def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
     _folder(tmp_path / "room")
     (tmp_path / "room" / "poses.json").write_text('{\n "convention": "cam2world opencv",\n}')
     expect_error(r"poses\.json: needed JSON, got invalid text at line [23]", load_sets, tmp_path / "room")
-    _write_panorama(tmp_path / "flats" / "one" / "left.png")
+    write_grey(tmp_path / "flats" / "one" / "left.png")
     expect_error(r"flats: needed panoramas .* got some without poses in one", load_sets, tmp_path / "flats")
     (tmp_path / "note.txt").write_text("x")
     expect_error(r"note\.txt: .* got another file", load_sets, tmp_path / "note.txt")
@@ -246,7 +214,7 @@ def _check_single_view(pair, name: str, world: int = 0) -> None:
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "exr"])
 def test_one_panorama_is_a_pair_of_one_view(tmp_path: Path, suffix: str) -> None:
     image = tmp_path / "flat" / f"photo.{suffix}"
-    _write_panorama(image, 0.25)
+    write_grey(image, 0.25)
     for path, name in ((image, "photo"), (image.parent, "flat")):
         (pair,) = load_sets(path, near=0.3, far=5)
         _check_single_view(pair, name)
@@ -269,7 +237,7 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
     folder = _folder(tmp_path / "room")
     for name in ("attic.jpg", "cellar.png", ".hidden.png", "left_mask.png", "attic_depth.png"):
         write_scene(folder / name, 8)
-    _write_panorama(folder / "film_frame.png")  # with the metadata of an own rendering
+    write_grey(folder / "film_frame.png")  # with the metadata of an own rendering
     with pytest.warns(UserWarning, match=r"poses\.json has no pose of attic\.jpg, cellar\.png; each is a scene"):
         pair, attic, cellar = load_sets(folder)
     assert (pair.name, [view.world for view in pair.context]) == ("room", [0, 0])
@@ -283,7 +251,7 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
 def test_pictures_that_poses_name_are_panoramas_whoever_made_them(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     for name in ("frame.png", "taken.png", "view.png"):
-        _write_panorama(folder / name)  # with the metadata of an own rendering
+        write_grey(folder / name)  # with the metadata of an own rendering
     content = json.loads((folder / "poses.json").read_text())
     content |= {"estimate": {"unplaced": {"frame.png": "no door", "taken.png": "bare walls"}}}
     (folder / "poses.json").write_text(json.dumps(content))
@@ -416,7 +384,7 @@ def test_rooms_of_poses_are_titles_unless_links_state_others(tmp_path: Path) -> 
 def test_a_faulty_web_tour_gives_way_to_the_pictures_of_the_folder(tmp_path: Path) -> None:
     (tmp_path / "tour.json").write_text("<html>404</html>")
     expect_error(r"tour\.json: needed a tour of Pannellum .* got an HTML page", load_sets, tmp_path)
-    _write_panorama(tmp_path / "hall.png")
+    write_grey(tmp_path / "hall.png")
     with pytest.warns(UserWarning, match=r"the web tour is left out: .*tour\.json"):
         (pair,) = load_sets(tmp_path)
     assert pair.context[0].name == "hall"

@@ -139,9 +139,6 @@ def test_a_number_in_scale_txt_is_metres_per_unit(room: Path, name: str) -> None
         expect_error(r"scale\.txt: needed one positive number", load_collections, room)
 
 
-# Paths that a file states
-
-
 RECONSTRUCTIONS = [
     state_nerfstudio, state_colmap, state_openmvg, state_openmvg_root, state_opensfm, state_metashape,
 ]  # fmt: skip
@@ -149,9 +146,7 @@ RECONSTRUCTIONS = [
 
 @pytest.mark.parametrize("outside", ["{}/secret.png", "..\\secret.png"])
 @pytest.mark.parametrize("state", RECONSTRUCTIONS)
-def test_pictures_that_lead_out_of_a_reconstruction_are_left_out_with_a_note(
-    room: Path, state: State, outside: str
-) -> None:
+def test_pictures_that_lead_out_of_a_reconstruction_are_left_out_with_a_note(room, state, outside) -> None:
     state(room, [*NAMES, outside.format(room.parent).replace("\\", "/")])
     _, files, notes = read(room)
     assert files == set(NAMES)
@@ -231,9 +226,6 @@ def test_a_path_inside_is_normal_and_one_outside_is_none(tmp_path: Path) -> None
     for name in ("..", "../x", "/", "a/../../x", "x\0", str(tmp_path.parent / "a")):
         assert find_inside(tmp_path, name) is None
         expect_error("needed a file inside", locate_inside, tmp_path, name)
-
-
-# Notes
 
 
 def test_notes_of_a_marzipano_tour_are_the_same_however_it_is_opened(room: Path) -> None:

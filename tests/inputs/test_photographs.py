@@ -13,9 +13,7 @@ from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.photographs import write_notes
 
 
-def test_panoramas_and_faces_of_a_folder_are_listed_by_name(
-    tmp_path: Path, write_scene, color_face, check_colors
-) -> None:
+def test_panoramas_and_faces_of_a_folder_are_listed_by_name(tmp_path, write_scene, color_face, check_colors) -> None:
     write_scene(tmp_path / "hall.jpg", 64)
     write_scene(tmp_path / "hall.png", 32)
     write_scene(tmp_path / "hall_jpg.jpg", 32)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from refusals import expect_error
 
-from pansplat.gaussians.harmonics import rotate_harmonics
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.geometry.pose import rotations_from_quats
@@ -17,7 +16,6 @@ from pansplat.model.heads import (
     GaussianHeads,
     HeadsConfig,
     MatchedViews,
-    adapt_gaussians,
 )
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.network import build_auxiliary_heads
@@ -28,13 +26,6 @@ _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
 
 def _random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def _pose(seed: int = 5) -> torch.Tensor:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(_random(4, seed=seed))
-    pose[:3, 3] = _random(3, seed=seed + 1)
-    return pose
 
 
 def _heads(compat="fixed", **changes: object) -> GaussianHeads:
@@ -69,15 +60,11 @@ def _difference(a: Gaussians, b: Gaussians) -> float:
     return max(float((getattr(a, name) - getattr(b, name)).detach().abs().max()) for name in _FIELDS)
 
 
-# Tiles
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("tiles", [2, 4])
-def test_tiled_heads_equal_untiled(tiles):
+def test_tiled_heads_equal_untiled():
     heads, matched = _heads(), _matched(views=1)
     with torch.no_grad():
-        assert _difference(heads(matched)[0], heads(matched, tiles=tiles)[0]) < 1e-12
+        assert _difference(heads(matched)[0], heads(matched, tiles=4)[0]) < 1e-12
 
 
 def test_official_tiles_change_the_output():
@@ -106,18 +93,12 @@ def test_a_tile_computed_alone_has_the_same_gaussians_and_gradients():
         assert torch.allclose(parameter.grad, gradient, atol=1e-10)
 
 
-# Symmetries
-
-
 @pytest.mark.parametrize("compat", ["official", "fixed"])
 def test_order_is_level_coarse_to_fine_then_view_then_point(compat):
     with torch.no_grad():
         gaussians = _heads(compat)(_matched(views=3))[0]
     expected = [(level, view) for level in (3, 2, 1, 0) for view in range(3) for _ in range(lattice_size(128 >> level))]
     assert list(zip(gaussians.levels.tolist(), gaussians.views.tolist(), strict=True)) == expected
-
-
-# Bounds, precision
 
 
 def test_depth_stays_within_its_bounds():
@@ -149,9 +130,6 @@ def test_unusable_heights_are_refused():
     expect_error("at least 56 pixels high, got 48", lambda: _heads()(_matched(48)))
 
 
-# Auxiliary heads
-
-
 def test_auxiliary_heads_give_a_set_for_each_swept_level():
     torch.manual_seed(0)
     config = HeadsConfig(depth="swept", layers=2, feature_channels=(6, 5, 4), candidates=4, adapter=SMALL.adapter)
@@ -173,40 +151,3 @@ def test_auxiliary_heads_have_the_shapes_of_the_official_ones(recipe):
     with torch.device("meta"):
         ours = build_auxiliary_heads(PanSplat(compat="official")).state_dict()
     assert sorted(tuple(t.shape) for t in official.values()) == sorted(tuple(t.shape) for t in ours.values())
-
-
-# Adapter
-
-
-def _adapt(cam2world: torch.Tensor, colors=None) -> Gaussians:
-    """30 Gaussians of random parameters."""
-    config = AdapterConfig()
-    return adapt_gaussians(
-        _random(30, config.num_parameters),
-        _random(30, 2, seed=1).sigmoid(),
-        _random(30, seed=2).exp(),
-        _random(30, seed=3).sigmoid(),
-        cam2world,
-        map_height=64,
-        colors=colors,
-        level=2,
-        view=1,
-        config=config,
-        compat="fixed",
-    )
-
-
-def test_a_base_colour_is_added_to_the_constant_harmonic():
-    colors = _random(30, 3, seed=9).sigmoid()
-    difference = _adapt(_pose(), colors=colors).harmonics - _adapt(_pose()).harmonics
-    assert torch.allclose(difference[:, 0], 2 * colors - 1) and float(difference[:, 1:].abs().max()) < 1e-14
-
-
-def test_rotating_the_world_rotates_the_gaussians():
-    pose, world = _pose(), _pose(seed=11)
-    before, after = _adapt(pose), _adapt(world @ pose)
-    rotation = world[:3, :3]
-    assert torch.allclose(after.means, before.means @ rotation.T + world[:3, 3], atol=1e-12)
-    assert torch.allclose(after.covariances, rotation @ before.covariances @ rotation.T, atol=1e-14)
-    assert torch.allclose(after.harmonics, rotate_harmonics(before.harmonics, rotation), atol=1e-13)
-    assert torch.equal(after.scales, before.scales) and torch.equal(after.opacities, before.opacities)

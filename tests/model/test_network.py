@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +11,6 @@ import pytest
 import torch
 from fake_card import CARD, pretend_card
 from refusals import expect_error
-from torch import Tensor
 
 from pansplat.errors import InputWarning
 from pansplat.gaussians.scene import Gaussians
@@ -120,9 +119,6 @@ def test_the_fingerprint_depends_on_weights_settings_compatibility_and_precision
     assert _predictor(small_config).fingerprint == predictors[0].fingerprint
 
 
-# Refusals
-
-
 @pytest.fixture
 def refuse(small_config, unchecked):
     """Check that a prediction is refused with a message."""
@@ -176,16 +172,13 @@ def test_out_of_a_cards_memory_a_network_has_more_tiles_and_then_the_processor(
     assert len(gaussians) == len(prediction)
 
 
-@pytest.mark.parametrize("full_after", [0, 1, 3])
-def test_out_of_a_cards_memory_the_processor_makes_the_tiles_that_are_left(
-    small_config, prediction: Gaussians, monkeypatch: pytest.MonkeyPatch, full_after: int
-) -> None:
+def test_out_of_a_cards_memory_the_processor_makes_the_tiles_that_are_left(small_config, prediction, monkeypatch):
     predictor = _predictor(small_config, tiles=2)
     lift = predictor.network.lift_gaussians
 
     def lift_gaussians(matched, *, tiles: int) -> Iterator[TileGaussians]:
         for done, part in enumerate(lift(matched, tiles=tiles)):
-            if done == full_after and part.gaussians[0].means.device == CARD:
+            if done == 1 and part.gaussians[0].means.device == CARD:
                 raise torch.cuda.OutOfMemoryError("CUDA out of memory")
             yield part
 
@@ -195,11 +188,8 @@ def test_out_of_a_cards_memory_the_processor_makes_the_tiles_that_are_left(
             predictor.network.to(CARD)
             made = predict(*_inputs(), 0.5, 20.0)
         assert str(notes[-1].message).endswith("it runs on the processor")
-        assert len(notes) == (1 if full_after else 3) and len(made) == len(prediction)
+        assert len(notes) == 1 and len(made) == len(prediction)
         assert made.means.sort(dim=0).values.allclose(prediction.means.sort(dim=0).values, atol=1e-4)
-
-
-# Loading
 
 
 @pytest.fixture
@@ -232,20 +222,7 @@ def test_a_loaded_network_predicts_as_the_saved_one(file: Path, small_config: Pa
     assert torch.allclose(means, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_loading_draws_no_random_numbers_and_fills_every_tensor(file: Path) -> None:
-    torch.manual_seed(0)
-    expected = torch.rand(3)
-    torch.manual_seed(0)
-    network = _network_of(load_network_predictor(file))
-    assert torch.equal(torch.rand(3), expected)
-    held = [*network.parameters(), *network.buffers()]
-    assert not any(tensor.is_meta for tensor in held)
-    assert not any(module.training for module in network.modules())
-
-
-def test_a_checkpoint_and_its_converted_file_load_equally(
-    tmp_path: Path, recipe_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
-) -> None:
+def test_a_checkpoint_and_its_converted_file_load_equally(tmp_path, recipe_weights, as_lightning) -> None:
     content = as_lightning(recipe_weights)
     torch.save(content, tmp_path / "original.ckpt")
     save_weights(tmp_path / "converted.safetensors", convert_checkpoint(content, "original.ckpt"))

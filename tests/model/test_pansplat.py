@@ -32,9 +32,6 @@ def prediction(network, make_inputs):
         return network(*make_inputs(32))
 
 
-# Symmetries of the fixed network
-
-
 def test_rotating_the_world_rotates_the_prediction(network, prediction, make_inputs):
     images, poses, near, far = make_inputs(32)
     world = torch.eye(4, dtype=torch.float64)
@@ -58,9 +55,6 @@ def test_rolling_panoramas_and_turning_poses_by_half_a_turn_rolls_the_depth(netw
         after = network(images.roll(32, dims=-1), poses @ half_turn, near, far)
     for a, b in zip(after.depths.depth, before.depths.depth, strict=True):
         assert torch.allclose(a, b.roll(b.shape[-1] // 2, dims=-1), atol=1e-9)
-
-
-# Views, sizes, configurations
 
 
 def test_large_panoramas_are_matched_at_low_and_lifted_at_full_resolution(network, monkeypatch, make_inputs):
@@ -116,9 +110,6 @@ def test_heads_read_the_candidates_of_a_single_swept_level(small, make_inputs):
 def test_heads_that_do_not_fit_the_features_are_refused(small):
     with pytest.raises(ValueError, match=r"must be \(16, 8, 8, 4\), the channels of the features"):
         dataclasses.replace(small, heads=dataclasses.replace(small.heads, feature_channels=(8, 8, 8, 4)))
-
-
-# Precision
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import torch
 from onnx_files import FakeSession, Node, write_onnx
 from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.networks.relative_depth import RelativeDepthNetwork, load_relative_depth
 
 _MEAN, _DEVIATION = np.array((0.485, 0.456, 0.406)), np.array((0.229, 0.224, 0.225))
@@ -55,39 +54,41 @@ def test_file_with_an_output_of_another_rank_is_refused(tmp_path):
     expect_error(r"kept\.onnx: .*\(1, 1, 28, 28\)", lambda: network(torch.zeros(3, 28, 28)))
 
 
+IMAGE, MASK = ("image", "tensor(float)", (1, 3, 8, 8)), ("mask", "tensor(float)", (1, 1, 8, 8))
+
+
 @pytest.mark.parametrize(
     "inputs",
     [
-        [("image", "tensor(float)", (1, 3, 8, 8)), ("mask", "tensor(float)", (1, 1, 8, 8))],
-        [("image", "tensor(float)", (3, 8, 8))],
-        [("image", "tensor(float)", (1, 4, 8, 8))],
-        [("image", "tensor(float)", (2, 3, 8, 8))],
+        [IMAGE, MASK],
+        *([("image", "tensor(float)", shape)] for shape in ((3, 8, 8), (1, 4, 8, 8), (2, 3, 8, 8))),
         [("image", "tensor(uint8)", (1, 3, 8, 8))],
     ],
 )
 def test_other_inputs_are_refused_and_named(inputs):
-    with pytest.raises(InputError, match=r"net\.onnx: .* inputs image tensor"):
-        RelativeDepthNetwork(FakeSession(None, inputs), "net.onnx", "")
+    expect_error(r"net\.onnx: .* inputs image tensor", RelativeDepthNetwork, FakeSession(None, inputs), "net.onnx", "")
 
 
-def _network(function):
-    return RelativeDepthNetwork(FakeSession(function, [("image", "tensor(float)", (1, 3, 8, 8))]), "net.onnx", "")
+def _estimate(function, images):
+    return RelativeDepthNetwork(FakeSession(function, [IMAGE]), "net.onnx", "").estimate(images)
 
 
-def test_output_that_is_not_finite_is_refused():
-    with pytest.raises(InputError, match=r"net\.onnx: .* NaN"):
-        _network(lambda image: [np.full((1, 8, 8), np.nan)])(torch.zeros(3, 8, 8))
+def _fail(image):
+    raise RuntimeError("Got invalid dimensions\nmore")
 
 
-def test_failure_of_the_network_is_named():
-    def fail(image):
-        raise RuntimeError("Got invalid dimensions\nmore")
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda image: [np.full((1, 8, 8), np.nan)], "NaN"),
+        (lambda image: [np.full((1, 8, 8), 3.0)], "constant"),
+        (_fail, "invalid dimensions. .* 8x8"),
+    ],
+)
+def test_a_failure_and_outputs_that_are_not_finite_or_all_constant_are_refused(function, message):
+    expect_error(rf"net\.onnx: .*{message}", _estimate, function, torch.zeros(2, 3, 8, 8))
 
-    expect_error(r"net\.onnx: .*invalid dimensions. .* 8x8", lambda: _network(fail)(torch.zeros(3, 8, 8)))
 
-
-def test_constant_output_of_all_images_is_refused_and_of_some_accepted():
-    images = torch.zeros(2, 3, 8, 8)
-    expect_error(r"net\.onnx: .* constant", lambda: _network(lambda image: [np.full((1, 8, 8), 3.0)]).estimate(images))
-    images[1] = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
-    assert len(_network(lambda image: [image[:, 0]]).estimate(images)) == 2
+def test_a_constant_output_of_some_images_is_accepted():
+    images = torch.stack((torch.zeros(3, 8, 8), torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))))
+    assert len(_estimate(lambda image: [image[:, 0]], images)) == 2

@@ -51,9 +51,6 @@ def make_weights() -> WeightsFile:
     return WeightsFile("pansplat", {"width": 3, "levels": [1, 2]}, "fixed", tensors)
 
 
-# Our files
-
-
 def test_saved_weights_load_unchanged(tmp_path: Path) -> None:
     before = make_weights()
     save_weights(tmp_path / "w.safetensors", before)
@@ -82,9 +79,6 @@ def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
     expect_error("needed compat official or fixed in its metadata, got 'new'", load_weights, path)
 
 
-# Settings
-
-
 def test_settings_are_restored_from_json() -> None:
     values = {"kind": "b", "sizes": [3, 4, 5], "inner": {"width": 2}, "several": [{"width": 5}]}
     assert config_from_dict(Config, values) == Config("b", (3, 4, 5), Inner(2), (Inner(5),))
@@ -95,9 +89,6 @@ def test_settings_of_another_version_are_refused() -> None:
     expect_error(r"unknown .*config\.extra", config_from_dict, Config, values | {"extra": 1})
     expect_error(r"unknown .*config\.inner\.wide", config_from_dict, Config, values | {"inner": {"wide": 1}})
     expect_error(r"config, kind: needed a known value, got 'c'", config_from_dict, Config, values | {"kind": "c"})
-
-
-# Checkpoints
 
 
 @pytest.mark.parametrize("zipped", [True, False])

@@ -148,8 +148,9 @@ def find_walls() -> Callable[[Array, Array], Array]:
 
 @pytest.fixture(scope="module")
 def few_samples() -> Iterator[None]:
-    """Fewer random samples, and matches of the polish: rooms are easy, and their tests are about whole folders."""
+    """Fewer keypoints, random samples and matches of the polish: rooms are easy, their tests are of whole folders."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pansplat.poses.two_view._TOP_SETS", (80, 2500))
         patch.setattr("pansplat.poses.two_view._MAX_POLISHED", 250)
+        patch.setattr("pansplat.poses.learned._KEYPOINTS", 160)
         yield

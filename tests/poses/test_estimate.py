@@ -86,9 +86,7 @@ def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, 
 
 
 @pytest.mark.slow
-def test_a_folder_without_poses_is_loaded_with_estimated_ones(
-    photographs: Path, estimate: PoseEstimate, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_poses_is_loaded_with_estimated_ones(photographs, estimate, monkeypatch) -> None:
     monkeypatch.setattr("pansplat.poses.files.estimate_poses", lambda images, **options: estimate)
     message = "has no poses; they were estimated: 2 of 2 panoramas"
     with pytest.warns(UserWarning, match=message):
@@ -204,7 +202,7 @@ def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatc
     monkeypatch.setattr("pansplat.poses.estimate._is_mirrored", lambda *_: False)
     monkeypatch.setattr("pansplat.poses.estimate.polish_relative_pose", lambda relation, *_: relation)
     monkeypatch.setattr("pansplat.poses.estimate.match_features", lambda *_: MagicMock())
-    monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_: MagicMock())
+    monkeypatch.setattr("pansplat.poses.estimate._match", lambda *_, **__: MagicMock())
     links = {pair: NO_LINKS for pair in itertools.combinations(range(11), 2)}
     relations = _relate_views(views, links, MagicMock(), Store(None))
     home = {pair for pair in relations if pair[1] < 8}
@@ -229,9 +227,7 @@ def test_a_mirror_image_of_symmetric_things_is_recognised(few_samples: None) -> 
     assert not _is_mirrored(views["left"], views["left"])
 
 
-def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estimate(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estimate(tmp_path, capsys, monkeypatch):
     (tmp_path / "room").mkdir()
     for name in ("a.png", "b.png"):
         cv2.imwrite(str(tmp_path / "room" / name), np.full((64, 128, 3), 90, np.uint8))

@@ -87,9 +87,7 @@ def test_matches_of_a_room_are_right(matcher: Matcher, room: tuple) -> None:
     assert all(len(np.unique(column)) == len(matches) for column in matches.indices.T)
 
 
-def test_a_matcher_on_a_card_finds_what_it_finds_on_the_processor(
-    matcher: Matcher, room: tuple, render_room: Callable[..., Array], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_matcher_on_a_card_finds_what_it_finds_on_the_processor(matcher, room, render_room, monkeypatch) -> None:
     monkeypatch.setattr(torch, "inference_mode", torch.no_grad)  # which the pretended card does not have
     image, expected = render_room(0, np.eye(3), np.zeros(3)), match_learned(matcher, room[0], room[1])
     with pretend_card() as count:

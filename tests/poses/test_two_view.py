@@ -151,9 +151,7 @@ def test_many_places_suffice_without_a_comparison(scene, quick) -> None:
     assert found.is_certain and found.log_odds == math.inf and found.places > 32
 
 
-def test_a_pose_without_a_distance_is_refused_though_its_matches_suffice(
-    see_room, look_around, quick, monkeypatch
-) -> None:
+def test_a_pose_without_a_distance_is_refused_though_its_matches_suffice(see_room, look_around, quick, monkeypatch):
     monkeypatch.setattr("pansplat.poses.depth._DISTANCES", (math.log(100), math.log(200)))
     found = estimate(see_room(10, 300, TURN, CENTRES[1]), surroundings=look(look_around, TURN, CENTRES[1]))
     assert found.places > 32 and math.isnan(found.distance)

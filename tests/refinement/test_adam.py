@@ -1,10 +1,7 @@
 """Adam of a refinement."""
 
 import math
-import subprocess
-import sys
 
-import pytest
 import torch
 
 from pansplat.refinement.adam import ParameterGroup
@@ -40,29 +37,6 @@ def test_gradients_that_are_not_finite_do_not_move_parameters() -> None:
     group.step(1.0)
     moved = parameter.tolist()
     assert moved[:2] == [0, 0] and moved[2] < 0
-
-
-@pytest.mark.slow
-def test_a_refinement_does_not_import_the_compiler() -> None:
-    program = """
-import sys, torch
-from pansplat.inputs.views import Views
-from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.pipeline import refine
-poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-poses[1, 0, 3] = 0.5
-means = 3 * torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
-labels = (torch.arange(50) % 2).to(torch.uint8)
-quats, harmonics = torch.eye(4)[:1].repeat(50, 1), torch.rand(50, 1, 3)
-gaussians = Gaussians(means, torch.full((50, 3), 0.3), quats, torch.full((50,), 0.5), harmonics, labels, labels)
-scene = Scene(gaussians, poses, 0.5, 10.0, ("a", "b"), "test", 16)
-images, masks = torch.rand(2, 3, 16, 32), torch.ones(2, 16, 32, dtype=torch.bool)
-views = Views(images=images, cam2world=poses, masks=masks, near=0.5, far=10.0, names=("a", "b"), depths=None)
-refine(scene, views, steps=2)
-print(*sorted({"torch._dynamo", "sympy"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
 
 
 def test_rows_that_do_not_move_keep_their_values_and_averages() -> None:

@@ -1,13 +1,11 @@
-"""Fixtures of the tests of renderers: backends, scenes, a pose, and the dense renderer."""
+"""Fixtures of the tests of renderers: backends."""
 
 import os
-from collections.abc import Callable
 from importlib.util import find_spec
 
 import dense_renderer
 import pytest
 import torch
-from torch import Tensor
 
 _TRITON = (
     pytest.mark.exhaustive,
@@ -21,24 +19,6 @@ def render(request: pytest.FixtureRequest) -> dense_renderer.Renderer:
     if request.param == "triton":
         request.getfixturevalue("triton_device")
     return dense_renderer.BACKENDS[request.param]
-
-
-@pytest.fixture
-def balls() -> Callable:
-    """Make spheres."""
-    return dense_renderer.make_spheres
-
-
-@pytest.fixture
-def make_scene() -> Callable:
-    """Make random Gaussians."""
-    return dense_renderer.make_scene
-
-
-@pytest.fixture
-def pose() -> Tensor:
-    """A camera rotated about all axes, not at the origin."""
-    return dense_renderer.POSE.clone()
 
 
 @pytest.fixture(scope="session")

@@ -143,12 +143,3 @@ def test_where_all_views_are_empty_there_is_background_without_gradient():
     assert not mixed.alpha[empty].any() and not mixed.depth[empty].any()
     (mixed.alpha[empty].sum() + mixed.depth[empty].sum()).backward()
     assert not weights.grad.any()
-
-
-def test_a_wrong_number_of_weights_is_refused():
-    with pytest.raises(ValueError, match=r"got shape \(3,\) for 1"):
-        blend([_image((0.0, 0.0, 0.0), 1.0)], torch.ones(3))
-    with pytest.raises(ValueError, match="at least one"):
-        blend([], torch.ones(0))
-    with pytest.raises(ValueError, match="at least one view"):
-        blend_weights(torch.zeros(3), torch.zeros(0, 3))

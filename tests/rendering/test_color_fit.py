@@ -80,11 +80,3 @@ def test_masked_pixels_do_not_change_colours(truth, photographs):
     west = truth.means[:, 0] < -0.5
     assert not fitted.harmonics[west].any()
     assert fitted.harmonics[truth.means[:, 0] > 0.5].abs().mean() > 0.2
-
-
-def test_colours_are_fitted_without_gradients_and_in_inference_mode(truth, photographs):
-    expected = _fit(_grey(truth), photographs).harmonics
-    for mode in (torch.no_grad, torch.inference_mode):
-        with mode():
-            fitted = _fit(_grey(truth), photographs).harmonics
-        assert torch.equal(fitted, expected) and not fitted.requires_grad

@@ -22,6 +22,9 @@ LAYOUTS = (("equirect", "ray"), ("pinhole", "ray"), ("cubemap", "ray"), ("pinhol
 RED_GREEN = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
 INTERPRETED = ("one, equirect", "small, cubemap ewa", "inside", "stack of 0.9", "odd size 5", "needles x ray")
 """The cases that also run under Triton's interpreter; a GPU runs all."""
+NOT_NUMERIC = ("crowd", "degree", "odd size", "more tiles", "2 channels", "32 channels")
+"""Cases in which torch's formulas are as exact in float32 as in others; float64 runs them."""
+TRUTHS: dict[str, dict] = {}
 
 
 def list_cases() -> Iterator[tuple[str, Case]]:
@@ -162,4 +165,6 @@ def test_images_and_gradients_equal_the_dense_renderers(case: str, render: Rende
         pytest.skip("numba has no EWA kernel")
     if render.interpreted and case not in INTERPRETED:
         pytest.skip("takes too long under Triton's interpreter")
-    assert_dense(render, scene, options)
+    if render.name == "torch" and render.dtype == torch.float32 and case.startswith(NOT_NUMERIC):
+        pytest.skip("as exact as other cases")
+    assert_dense(render, scene, options, TRUTHS.setdefault(case, {}))

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from dense_renderer import draw_dense
+from dense_renderer import POSE, draw_dense, make_scene, make_spheres
 
 from pansplat.geometry.pose import rotations_from_quats
 from pansplat.rendering import rasterize
@@ -33,18 +33,18 @@ def test_the_rays_of_a_column_touch_the_viewing_circle():
 
 
 @pytest.mark.parametrize("eye_offset", [0.25, -0.25])
-def test_each_column_is_that_of_a_panorama_from_its_own_eye(make_scene, pose, eye_offset):
+def test_each_column_is_that_of_a_panorama_from_its_own_eye(eye_offset):
     scene, size = make_scene(7, scale=0.4), (9, 18)
-    got = make_images(scene, pose, size, eye_offset=eye_offset)
+    got = make_images(scene, POSE, size, eye_offset=eye_offset)
     for column, eye in enumerate(ImagePlane(size, ORIGIN[:3, :3], 0.0, eye_offset).column_eyes()):
-        moved = pose.clone()
-        moved[:3, 3] += pose[:3, :3] @ eye
+        moved = POSE.clone()
+        moved[:3, 3] += POSE[:3, :3] @ eye
         expected = draw_dense(scene, moved, size)[:-1, :, column]
         assert (got[:, :, column] - expected).abs().max() < 1e-10
 
 
 @pytest.mark.parametrize("pairs", [columns._MAX_PAIRS, 1])
-def test_numba_equals_the_reference(make_scene, monkeypatch, pairs):
+def test_numba_equals_the_reference(monkeypatch, pairs):
     # The Gaussians surround the camera: some are inside the viewing circle, above it, or around it.
     monkeypatch.setattr(columns, "_MAX_PAIRS", pairs)
     scene, pose = make_scene(60, scale=0.08, extent=0.6), ORIGIN.clone()
@@ -56,8 +56,8 @@ def test_numba_equals_the_reference(make_scene, monkeypatch, pairs):
     assert (got - expected).abs().max() < 2e-5
 
 
-def test_gradients_are_those_of_the_reference(balls):
-    scene = balls([(0.5, 0.1, 1.0), (-0.8, -0.3, 0.7)])
+def test_gradients_are_those_of_the_reference():
+    scene = make_spheres([(0.5, 0.1, 1.0), (-0.8, -0.3, 0.7)])
 
     def total(means, **options):
         moved = dataclasses.replace(scene, means=means).to(dtype=means.dtype)
@@ -71,7 +71,7 @@ def test_gradients_are_those_of_the_reference(balls):
     assert float(means.grad[0, 0]) == pytest.approx(float(expected), rel=0.01)
 
 
-def test_unusable_gaussians_are_left_out(make_scene):
+def test_unusable_gaussians_are_left_out():
     scene = make_scene(30).to(dtype=torch.float32)
     scene.means[5] = torch.tensor((-0.06, 0.0, 0.0))  # nearer than 0.05 m to the eye of the last column only
     broken = dataclasses.replace(scene, means=scene.means.clone(), harmonics=scene.harmonics.clone())

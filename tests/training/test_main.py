@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,9 +33,7 @@ def test_a_folder_of_data_that_is_missing_is_named(tmp_path: Path, capsys: pytes
     assert not list(tmp_path.rglob("*.pt"))
 
 
-def test_out_of_memory_is_an_error_with_advice(
-    micro_run: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_out_of_memory_is_an_error_with_advice(micro_run, monkeypatch, capsys) -> None:
     def full(self: Trainer, batches: list) -> dict[str, float]:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes")
 
@@ -47,9 +44,7 @@ def test_out_of_memory_is_an_error_with_advice(
 
 
 @pytest.mark.slow
-def test_the_same_command_resumes_a_stopped_run(
-    micro_run: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_command_resumes_a_stopped_run(micro_run, monkeypatch, capsys) -> None:
     config = micro_run(steps=2, checkpoint=CheckpointConfig(every=0))
     monkeypatch.setattr(command, "parse", lambda argv: config)
     optimize = Trainer._optimize

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 
 import pytest
 import torch
+from dense_renderer import make_scene
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.training.config import Mixing, Style
@@ -21,26 +21,14 @@ CONTEXT = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
 CONTEXT[1, 0, 3] = 0.5
 
 
-def cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> Gaussians:
+def cloud(count: int = 400) -> Gaussians:
     """Random Gaussians around the camera; some are thin, contain the camera, are faint, or are not finite."""
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    directions = torch.nn.functional.normalize(normal(count, 3), dim=1)
-    radii = 0.5 + 3 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
-    means = directions * radii
-    means[:3] = POSE[:3, 3] + 0.01
-    scales = 0.1 * torch.exp(1.2 * normal(count, 3) - 1)
-    scales[3:6] = 2.0
-    opacities = torch.rand(count, generator=generator, dtype=torch.float64)
-    opacities[6:9] = 1e-4
-    means[9] = torch.nan
-    views = torch.arange(count) % 2
-    return Gaussians(means, scales, normal(count, 4), opacities, 0.3 * normal(count, 4, 3), views * 0, views).to(
-        dtype=dtype
-    )
+    scene = make_scene(count, scale=0.05, degree=1)
+    scene.means[:3], scene.means[9] = POSE[:3, 3] + 0.01, torch.nan
+    scene.scales[:, 0] *= 0.2
+    scene.scales[3:6] = 2.0
+    scene.opacities[6:9] = 1e-4
+    return dataclasses.replace(scene, views=torch.arange(count) % 2)
 
 
 @pytest.mark.parametrize(("style", "mixing"), list(itertools.product(STYLES, ("joint", "by_view"))))
@@ -71,13 +59,3 @@ def test_a_part_needs_few_of_the_gaussians(style: Style) -> None:
     masks = renderer.find_visible(small, POSE, renderer.list_parts(2))
     assert max(float(mask.double().mean()) for mask in masks) < 0.3
     assert sum(float(mask.double().mean()) for mask in masks) < 1.5
-
-
-@pytest.mark.parametrize("height", [32, 64, 512, 2048])
-def test_strips_cover_every_row_once_and_have_equal_areas(height: int) -> None:
-    renderer = TargetRenderer("panorama", "joint", height)
-    rows = [renderer._strip_rows(part.index) for part in renderer.list_parts(2)]
-    assert rows[0][0] == 0 and rows[-1][1] == height
-    assert all(before[1] == after[0] for before, after in itertools.pairwise(rows))
-    areas = [math.cos(math.pi * first / height) - math.cos(math.pi * end / height) for first, end in rows]
-    assert max(areas) - min(areas) < 4 * math.pi / height

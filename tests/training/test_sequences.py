@@ -10,7 +10,7 @@ import torch
 from refusals import expect_error
 
 from pansplat.training.sequences import BoundedSampler, FramePair, read_loc360
-from pansplat.training.sources import FixedFramePairs, RandomFramePairs
+from pansplat.training.sources import RandomFramePairs
 
 
 @pytest.mark.shared
@@ -64,13 +64,3 @@ def test_360loc_has_separate_locations_for_training_and_validation(tmp_path: Pat
     assert source.sample(25, 8, 0).name.startswith("hall-night_360_1")
     gap = float((first.context.cam2world[1] - first.context.cam2world[0])[0, 3])
     assert 2 <= gap <= 5 and first.context.far == 50
-
-
-def test_360loc_is_evaluated_on_all_frames_of_a_pair(tmp_path: Path, write_loc360: Callable) -> None:
-    write_loc360(tmp_path / "atrium" / "mapping" / "daytime_360_0")
-    source = FixedFramePairs(read_loc360(tmp_path, "val"), BoundedSampler(2, 5).evaluation)
-    assert len(source) == 100
-    last = source.sample(99, 8, 0)
-    assert last.context.names == ("5", "8") and last.targets.names == ("5", "6", "7", "8")
-    assert torch.equal(last.context.images[0], last.targets.images[0])
-    assert last.targets.cam2world[:, 0, 3].tolist() == [5, 6, 7, 8]

@@ -68,9 +68,7 @@ def test_a_killed_run_resumes_bit_identically(micro_run: Callable, monkeypatch: 
         assert torch.equal(found[name], tensor), name
 
 
-def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(
-    micro_run: Callable, sphere: type, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loss_that_is_not_finite_stops_the_run_and_saves_the_batch(micro_run, sphere, monkeypatch) -> None:
     source = sphere(8, broken=frozenset(range(8)))
     monkeypatch.setattr(trainer, "load_sources", lambda *_: (source, source))
     config = micro_run()

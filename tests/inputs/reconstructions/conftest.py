@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy import ndarray as Array
+from panorama_fixtures import color_directions
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -16,12 +17,6 @@ from pansplat.geometry.equirect import pixel_directions, uv_from_directions
 from pansplat.inputs.panorama_sets import Panorama
 
 HEIGHT = 64
-
-
-def color(rays: Array) -> Array:
-    """8-bit colours of directions in the world (... 3)."""
-    unit = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    return np.rint(127.5 + 100 * unit).astype(np.uint8)
 
 
 @pytest.fixture(scope="session")
@@ -49,7 +44,7 @@ def write_panorama() -> Callable[[Path, Array], None]:
     def write(path: Path, cam2world: Array) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         rays = pixel_directions(HEIGHT, 2 * HEIGHT, dtype=torch.float64).numpy() @ cam2world[:3, :3].T
-        Image.fromarray(color(rays)).save(path)
+        Image.fromarray(color_directions(rays)).save(path)
 
     return write
 
@@ -63,7 +58,7 @@ def write_view() -> Callable[..., None]:
         fx, fy, cx, cy = lens
         y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
         rays = np.stack(((x - cx) / fx, (y - cy) / fy, np.ones_like(x)), axis=-1) @ cam2world[:3, :3].T
-        Image.fromarray(color(rays)).save(path)
+        Image.fromarray(color_directions(rays)).save(path)
 
     return write
 
@@ -89,7 +84,7 @@ def check_colors() -> Callable[..., None]:
     def check(image: torch.Tensor, cam2world: torch.Tensor, tolerance: float = 4) -> None:
         height = image.shape[1]
         rays = pixel_directions(height, 2 * height, dtype=torch.float64) @ cam2world[:3, :3].T
-        assert np.nanmax(np.abs(image.permute(1, 2, 0).numpy() * 255 - color(rays.numpy()))) < tolerance
+        assert np.nanmax(np.abs(image.permute(1, 2, 0).numpy() * 255 - color_directions(rays.numpy()))) < tolerance
 
     return check
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-import weakref
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ import torch
 from numpy import ndarray as Array
 from PIL import Image
 
-from pansplat.export import training_set
 from pansplat.export.training_set import write_dataset
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.folders import load_sets
@@ -90,9 +88,7 @@ def test_both_files_project_a_point_to_the_same_pixel(dataset: Path, points: Arr
 
 
 @pytest.mark.parametrize("kind", ["nerfstudio", "colmap text", "colmap binary"])
-def test_a_round_trip_keeps_poses_and_pictures(
-    dataset: Path, cameras: list[Array], kind: str, check_colors, tmp_path: Path
-) -> None:
+def test_a_round_trip_keeps_poses_and_pictures(dataset, cameras, kind, check_colors, tmp_path) -> None:
     dataset = shutil.copytree(dataset, tmp_path / "set")
     if kind != "nerfstudio":
         (dataset / "transforms.json").unlink()
@@ -113,25 +109,3 @@ def test_a_round_trip_keeps_poses_and_pictures(
             assert shown[:48].all() and not shown[53:].any()
         else:
             check_colors(image, view.cam2world)
-
-
-def test_one_picture_is_in_memory_at_a_time(
-    tmp_path: Path, cameras: list[Array], write_panorama, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A panorama with a mask has six faces and six masks: each is gone before the one after the next is written."""
-    image, mask = tmp_path / "p.png", tmp_path / "m.png"
-    write_panorama(image, cameras[0])
-    Image.fromarray(np.arange(64 * 128, dtype=np.uint8).reshape(64, 128) // 128 * 255).save(mask)
-    view = Panorama("p", image, torch.from_numpy(cameras[0]), mask)
-    written: list[weakref.ref] = []
-
-    def write(path: Path, pixels: Array, *, panorama: bool) -> None:
-        assert sum(picture() is not None for picture in written) <= 1, "the face of this mask, or the last face"
-        assert pixels.base is None, "no view of an array of all faces"
-        written.append(weakref.ref(pixels))
-
-    monkeypatch.setattr(training_set, "write_image", write)
-    folder = tmp_path / "set"
-    folder.mkdir()
-    write_dataset(folder, [view], (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert len(written) == 12

@@ -1,16 +1,13 @@
 """Tours of Pannellum open with their pictures, titles, links and start views, whatever else is broken."""
 
-import contextlib
 import json
 import math
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from PIL import Image
 
-from pansplat.errors import InputError
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.panorama_sets import Link, Note
@@ -191,31 +188,3 @@ def test_json_files_of_other_kinds_are_no_tours(tmp_path: Path) -> None:
     ):
         _write(tmp_path, text, name)
     assert find_web_tours(tmp_path) == []
-
-
-HOSTILE_PAGES = {  # file, repetitions, text of n repetitions
-    "calls": ("tour.html", 4000, lambda n: "pannellum.viewer(1);" * n),
-    "calls in calls": ("tour.html", 40, lambda n: "pannellum.viewer(" * n + ")" * n),
-    "digits": ("tour.html", 1000, lambda n: f"pannellum.viewer({'1' * n}a);"),
-    "spaces": ("tour.html", 4000, lambda n: f"pannellum.viewer({' ' * n}"),
-    "assignments": ("data.js", 40, lambda n: "a={" * n + "}" * n),
-}
-
-
-@pytest.mark.parametrize("case", HOSTILE_PAGES)
-def test_the_time_of_a_page_grows_in_proportion_to_its_size(tmp_path: Path, case: str) -> None:
-    name, count, make_text = HOSTILE_PAGES[case]
-    growth = 10
-
-    def measure(repetitions: int) -> float:
-        (tmp_path / name).write_text(make_text(repetitions))
-        seconds = []
-        for _ in range(3):
-            start = time.process_time()  # of this process only: other programs do not count
-            with contextlib.suppress(InputError):
-                load_panoramas(tmp_path / name)
-            seconds.append(time.process_time() - start)
-        return min(seconds)
-
-    short, long = measure(count), measure(growth * count)
-    assert long < 3 * growth * short, f"{short:.4f} s, {long:.4f} s"

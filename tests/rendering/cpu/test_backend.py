@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from dense_renderer import BACKENDS, find_gradients
+from dense_renderer import BACKENDS, POSE, find_gradients, make_scene
 
 from pansplat.errors import InputError
 from pansplat.rendering import rasterize, reference
@@ -15,14 +15,14 @@ NUMBA = BACKENDS["numba"]
 
 
 @pytest.fixture
-def scene(make_scene):
+def scene():
     return make_scene(300, scale=0.15, degree=2, seed=1).to(dtype=torch.float32)
 
 
-def test_bands_change_no_bit_of_the_image(scene, pose, monkeypatch):
+def test_bands_change_no_bit_of_the_image(scene, monkeypatch):
     def draw():
         options = {"size": (50, 70), "layout": "pinhole"}
-        return NUMBA(scene, pose, **options).color, find_gradients(NUMBA, scene, pose, **options)
+        return NUMBA(scene, POSE, **options).color, find_gradients(NUMBA, scene, POSE, **options)
 
     whole, gradients = draw()
     monkeypatch.setattr(tiling, "MAX_INTERSECTIONS", 20)
@@ -45,14 +45,14 @@ def test_numba_is_the_default_backend_for_float32_and_the_exact_kernel(dtype, ke
     assert _select_backend(name, scene.to(dtype=dtype), kernel) is expected
 
 
-def test_other_kernels_and_channels_are_refused(scene, pose):
+def test_other_kernels_and_channels_are_refused(scene):
     gray = dataclasses.replace(scene, harmonics=scene.harmonics[..., :1])
     assert _select_backend("auto", gray, "ray") is reference.rasterize_planes
     for given, kernel in ((scene, "ewa"), (gray, "ray")):
         with pytest.raises(InputError, match=f"kernel '{kernel}' and . channels"):
-            rasterize(given, pose, size=(8, 16), layout="cubemap", kernel=kernel, backend="numba")
+            rasterize(given, POSE, size=(8, 16), layout="cubemap", kernel=kernel, backend="numba")
 
 
-def test_a_side_longer_than_32767_pixels_is_refused(scene, pose):
+def test_a_side_longer_than_32767_pixels_is_refused(scene):
     with pytest.raises(InputError, match="at most 32767 pixels a side"):
-        rasterize(scene, pose, size=(1, 40000), layout="pinhole", backend="numba")
+        rasterize(scene, POSE, size=(1, 40000), layout="pinhole", backend="numba")

@@ -39,11 +39,6 @@ def display(scene):
     return DisplayScene(*fields, reach)
 
 
-@pytest.fixture(scope="module")
-def pose():
-    return POSE
-
-
 def draw(display, pose, labels, layers, selection=None):
     plane = ImagePlane(SIZE, pose[:3, :3], FOCAL)
     position, options = pose[:3, 3].numpy(), {"selection": selection, "min_transmittance": 1e-7}
@@ -58,40 +53,34 @@ def frustum(pose, scale=1.0):
     return Selection(normals @ pose[:3, :3].numpy().T, deviation)
 
 
-def test_layers_are_the_images_of_their_gaussians(scene, display, pose):
-    sums = draw(display, pose, scene.views.numpy(), 2).sums
+def test_layers_are_the_images_of_their_gaussians(scene, display):
+    sums = draw(display, POSE, scene.views.numpy(), 2).sums
     for view in (0, 1):
         part = scene.select(scene.views == view)
-        expected = rasterize(part, pose, size=SIZE, layout="pinhole", vertical_fov_degrees=FOV, backend="numba")
+        expected = rasterize(part, POSE, size=SIZE, layout="pinhole", vertical_fov_degrees=FOV, backend="numba")
         assert np.abs(sums[view, :3] - expected.color.numpy()).max() <= 2e-6
         assert np.abs(sums[view, 4] - expected.alpha.numpy()).max() <= 2e-6
 
 
-def test_selection_does_not_change_the_image_and_leaves_gaussians_out(scene, display, pose):
+def test_selection_does_not_change_the_image_and_leaves_gaussians_out(scene, display):
     labels = np.zeros(len(scene))
-    whole, selected = draw(display, pose, labels, 1), draw(display, pose, labels, 1, frustum(pose))
+    whole, selected = draw(display, POSE, labels, 1), draw(display, POSE, labels, 1, frustum(POSE))
     assert whole.selected == np.count_nonzero(scene.opacities > 1 / 255) and selected.selected < 0.6 * whole.selected
     assert np.array_equal(whole.sums, selected.sums)
-    narrow = draw(display, pose, labels, 1, frustum(pose, 0.2))
+    narrow = draw(display, POSE, labels, 1, frustum(POSE, 0.2))
     assert not np.array_equal(whole.sums, narrow.sums), "the bound is not infinite"
 
 
-def test_gaussians_without_a_layer_are_not_drawn(display, pose):
-    assert not draw(display, pose, np.full(600, NO_LAYER), 1).sums.any()
+def test_gaussians_without_a_layer_are_not_drawn(display):
+    assert not draw(display, POSE, np.full(600, NO_LAYER), 1).sums.any()
 
 
-@pytest.mark.parametrize("labels", [np.full(600, 2), np.full(600, -2), np.zeros(599)])
-def test_labels_without_a_layer_are_refused(labels, display, pose):
-    with pytest.raises(ValueError, match="must hold 600 numbers from -1 to 1"):
-        draw(display, pose, labels, 2)
-
-
-def test_blended_layers_equal_those_of_the_definition(scene, display, pose):
-    sums = draw(display, pose, scene.views.numpy(), 2).sums
+def test_blended_layers_equal_those_of_the_definition_and_pixels_are_rounded(scene, display):
+    sums = draw(display, POSE, scene.views.numpy(), 2).sums
     background, weights = (0.2, 0.5, 0.9), torch.tensor((0.7, 0.3))
     images = [
         rasterize(
-            scene.select(scene.views == view), pose, size=SIZE, layout="pinhole", vertical_fov_degrees=FOV,
+            scene.select(scene.views == view), POSE, size=SIZE, layout="pinhole", vertical_fov_degrees=FOV,
             background=background, backend="numba",
         )
         for view in (0, 1)
@@ -101,25 +90,19 @@ def test_blended_layers_equal_those_of_the_definition(scene, display, pose):
     assert np.abs(color[..., :3] - expected.color.permute(1, 2, 0).numpy()).max() <= 1e-5
     assert np.abs(color[..., 3] - expected.alpha.numpy()).max() <= 1e-5
     assert np.abs(depth - expected.depth.numpy()).max() <= 1e-4
+    for bottom_up in (False, True):
+        pixels = np.empty(SIZE, np.uint32)
+        blend_to_pixels(sums, weights.numpy(), background, pixels, bottom_up=bottom_up)
+        bytes_ = pixels.view(np.uint8).reshape(*SIZE, 4)[:: -1 if bottom_up else 1]
+        assert np.abs(bytes_[..., :3] - 255 * np.clip(color[..., :3], 0, 1)).max() <= 0.51
+        assert (bytes_[..., 3] == 255).all()
 
 
-@pytest.mark.parametrize("bottom_up", [False, True])
-def test_pixels_are_the_blended_layers_rounded(scene, display, pose, bottom_up):
-    sums = draw(display, pose, scene.views.numpy(), 2).sums
-    background, weights = (0.2, 0.5, 0.9), np.array((0.7, 0.3), np.float32)
-    color, _ = blend_layers(sums, weights, background)
-    pixels = np.empty(SIZE, np.uint32)
-    blend_to_pixels(sums, weights, background, pixels, bottom_up=bottom_up)
-    bytes_ = pixels.view(np.uint8).reshape(*SIZE, 4)[:: -1 if bottom_up else 1]
-    assert np.abs(bytes_[..., :3] - 255 * np.clip(color[..., :3], 0, 1)).max() <= 0.51
-    assert (bytes_[..., 3] == 255).all()
-
-
-def test_sampled_faces_show_smooth_functions_of_the_direction_without_seams(pose):
+def test_sampled_faces_show_smooth_functions_of_the_direction_without_seams():
     faces = PixelFaces.allocate(40.5)
     for face in range(6):
         write_directions(faces.plane(face).directions().numpy(), faces.pixels[face])
-    for rotation in (pose[:3, :3], torch.eye(3, dtype=torch.float64), pose[:3, :3].T):
+    for rotation in (POSE[:3, :3], torch.eye(3, dtype=torch.float64), POSE[:3, :3].T):
         for bottom_up in (False, True):
             found, expected = np.empty((60, 90), np.uint32), np.empty((60, 90), np.uint32)
             faces.sample(rotation.numpy(), 30.0, found, bottom_up=bottom_up)

@@ -12,6 +12,7 @@ import llvmlite.binding as llvm
 import numpy as np
 import pytest
 import torch
+from dense_renderer import make_scene
 
 from pansplat.rendering import rasterize
 
@@ -51,7 +52,7 @@ def _arm_assembly(code):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("processor", [_HASWELL, _X86_64], ids=["haswell", "x86-64"])
-def test_code_for_other_processors_is_vectorised_and_gives_the_same_result(processor, make_scene, tmp_path):
+def test_code_for_other_processors_is_vectorised_and_gives_the_same_result(processor, tmp_path):
     scene = make_scene(200, scale=0.15).to(dtype=torch.float32)
     fields = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
     torch.save(fields, tmp_path / "scene.pt")

@@ -7,7 +7,7 @@ import types
 
 import pytest
 import torch
-from dense_renderer import BACKENDS, FIELDS, assert_dense, find_gradients
+from dense_renderer import BACKENDS, FIELDS, POSE, assert_dense, find_gradients, make_scene
 from refusals import expect_error
 from torch import Tensor
 
@@ -19,21 +19,21 @@ TRITON = dataclasses.replace(BACKENDS["triton"], gradient=1e-5)
 EXACT = dataclasses.replace(TRITON, dtype=torch.float64)
 
 
-def test_a_small_image_and_its_gradients_equal_float64_torch(make_scene, pose):
-    assert_dense(TRITON, make_scene(3, scale=0.4, degree=1), {"size": (4, 8), "pose": pose})
+def test_a_small_image_and_its_gradients_equal_float64_torch():
+    assert_dense(TRITON, make_scene(3, scale=0.4, degree=1), {"size": (4, 8), "pose": POSE})
 
 
 @exhaustive
-def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(make_scene, pose, monkeypatch):
+def test_a_gaussian_over_many_tiles_has_the_gradient_of_float64_torch(monkeypatch):
     from pansplat.rendering.cuda import rasterize as stage
 
     monkeypatch.setattr(stage, "_MANY_TILES", 4)
     scene = make_scene(2, scale=1.5, extent=0.8, seed=1, degree=0)
-    assert_dense(TRITON, scene, {"size": (48, 96), "pose": pose})  # more than 16 tiles: a program sums in several steps
+    assert_dense(TRITON, scene, {"size": (48, 96), "pose": POSE})  # more than 16 tiles: a program sums in several steps
 
 
 @exhaustive
-def test_opaque_gaussians_around_the_camera_equal_float64_torch(make_scene):
+def test_opaque_gaussians_around_the_camera_equal_float64_torch():
     scene = make_scene(12, scale=1.5, extent=0.6, seed=2, degree=0)
     scene = dataclasses.replace(scene, opacities=torch.linspace(0.5, 2.0, 12, dtype=torch.float64))
     # Triton's tiles stop early.
@@ -43,29 +43,29 @@ def test_opaque_gaussians_around_the_camera_equal_float64_torch(make_scene):
 
 
 @exhaustive
-def test_gaussians_behind_a_saturated_tile_are_left_out(make_scene, pose):
+def test_gaussians_behind_a_saturated_tile_are_left_out():
     scene = make_scene(130, scale=3.0, extent=0.1, seed=2, degree=0)
     ahead = torch.tensor((0.0, 0.0, 3.0), dtype=torch.float64)
     scene = dataclasses.replace(
         scene,
-        means=(scene.means + ahead) @ pose[:3, :3].T + pose[:3, 3],
+        means=(scene.means + ahead) @ POSE[:3, :3].T + POSE[:3, 3],
         opacities=torch.full_like(scene.opacities, 0.2),  # 32 of them do not saturate
     )
     early = dataclasses.replace(TRITON, image=1e-4, gradient=1e-3)
-    options = {"size": (4, 4), "layout": "pinhole", "pose": pose, "fields": (*FIELDS, "pose")}
+    options = {"size": (4, 4), "layout": "pinhole", "pose": POSE, "fields": (*FIELDS, "pose")}
     _, (expected, got) = assert_dense(early, scene, options)
     hidden = (got["opacities"] == 0) & (expected["opacities"] != 0)
     assert 20 < int(hidden.sum()) < 100
 
 
 @exhaustive
-def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
+def test_an_image_is_the_same_in_narrow_bands(monkeypatch):
     from pansplat.rendering.cuda import tiling
 
     scene, size = make_scene(12, scale=0.3, degree=0), (20, 40)
 
     def draw() -> tuple[Rendering, dict[str, Tensor]]:
-        return EXACT(scene, pose, size=size), find_gradients(EXACT, scene, pose, size=size)
+        return EXACT(scene, POSE, size=size), find_gradients(EXACT, scene, POSE, size=size)
 
     (wide, gradients), bands = draw(), []
     with monkeypatch.context() as by_tiles:
@@ -79,9 +79,9 @@ def test_an_image_is_the_same_in_narrow_bands(make_scene, pose, monkeypatch):
             assert torch.allclose(found[name], expected, rtol=1e-12, atol=1e-12), name
 
 
-def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, monkeypatch):
+def test_gaussians_on_the_cpu_are_refused_unless_interpreted(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    expect_error("on 'cpu'", lambda: rasterize(make_scene(1), pose, size=(4, 8), backend="triton"))
+    expect_error("on 'cpu'", lambda: rasterize(make_scene(1), POSE, size=(4, 8), backend="triton"))
 
 
 @pytest.mark.parametrize(
@@ -92,11 +92,9 @@ def test_gaussians_on_the_cpu_are_refused_unless_interpreted(make_scene, pose, m
         (types.SimpleNamespace(__version__="2.3.1+git"), "which has version 2.3"),
     ],
 )
-def test_a_missing_or_old_triton_is_an_error_and_auto_does_not_select_it(
-    make_scene, pose, unchecked, monkeypatch, triton, found
-):
+def test_a_missing_or_old_triton_is_an_error_and_auto_does_not_select_it(unchecked, monkeypatch, triton, found):
     monkeypatch.setitem(sys.modules, "triton", triton)
-    expect_error(found, lambda: rasterize(make_scene(1), pose, size=(4, 8), backend="triton"))
+    expect_error(found, lambda: rasterize(make_scene(1), POSE, size=(4, 8), backend="triton"))
     assert select_automatically(is_cuda=True) is reference.rasterize_planes
 
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from dense_renderer import POSE, make_scene
 
 from pansplat.gaussians.scene import Scene
 from pansplat.model.network import build_network
@@ -32,12 +33,12 @@ def test_the_network_predicts_on_a_gpu_what_it_predicts_on_the_processor(tmp_pat
     assert float(((got - expected).abs() / expected).median()) < 1e-5
 
 
-def test_a_scene_is_rendered_on_a_gpu_as_on_the_processor(make_scene, pose):
+def test_a_scene_is_rendered_on_a_gpu_as_on_the_processor():
     gaussians = make_scene(40, scale=0.3, degree=1).to(dtype=torch.float32)
     gaussians = dataclasses.replace(gaussians, views=torch.arange(40) % 2)
     cameras = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     cameras[1, 0, 3] = 0.5
     scene = Scene(gaussians, cameras, 0.05, 10.0, height=32)
-    expected = render(scene, pose)
-    got = render(dataclasses.replace(scene, gaussians=gaussians.to(device="cuda")), pose)
+    expected = render(scene, POSE)
+    got = render(dataclasses.replace(scene, gaussians=gaussians.to(device="cuda")), POSE)
     assert got.color.is_cuda and float((got.color.cpu() - expected.color).abs().max()) < 1e-4
