@@ -76,9 +76,7 @@ def test_the_items_are_the_folders_with_panoramas(rooms: Path, write_pair: Calla
     assert list_items(rooms / "room1") == {"room1": rooms / "room1"}
 
 
-def test_only_what_is_not_up_to_date_is_made_and_takes_the_place_of_what_was(
-    rooms: Path, tmp_path: Path, sphere: None, write_pair: Callable[..., Path]
-) -> None:
+def test_only_what_is_not_up_to_date_is_made_and_takes_the_place_of_what_was(rooms, tmp_path, sphere, write_pair):
     out, room = tmp_path / "out", rooms / "room0"
     first = process(room, out, "predict,export", format="spz")
     assert (
@@ -124,9 +122,7 @@ def test_a_changed_note_of_a_hot_spot_makes_the_page_anew(tmp_path: Path, sphere
         assert text in page and len(json.loads(page.split("const HEADER = ")[1].split(";\n")[0])["edges"]) == 3
 
 
-def test_a_tour_and_each_pair_beside_it_have_one_file_of_each_step(
-    tmp_path: Path, sphere: None, write_tour: Callable[..., Path]
-) -> None:
+def test_a_tour_and_each_pair_beside_it_have_one_file_of_each_step(tmp_path, sphere, write_tour) -> None:
     house, out = write_tour(tmp_path / "house", 7, height=HEIGHT), tmp_path / "out"
     pairs = [{"context": [f"p{a}.png", f"p{a + 1}.png"]} for a in (0, 1, 3, 5)]
     (house / "pairs.json").write_text(json.dumps({"pairs": pairs}))
@@ -138,9 +134,7 @@ def test_a_tour_and_each_pair_beside_it_have_one_file_of_each_step(
     assert len(list_outputs(out)) == 6
 
 
-def test_other_pairs_and_approximate_places_have_outputs_of_other_names(
-    tmp_path: Path, sphere: None, write_tour: Callable[..., Path]
-) -> None:
+def test_other_pairs_and_approximate_places_have_outputs_of_other_names(tmp_path, sphere, write_tour) -> None:
     house, seen = write_tour(tmp_path / "house", 4, height=HEIGHT), set()
     poses = json.loads((house / "poses.json").read_text())
     del poses["poses"]["p3.png"]
@@ -195,9 +189,7 @@ def test_a_worker_with_another_predictor_is_refused(rooms: Path, tmp_path: Path,
     assert not list_outputs(tmp_path / "out")
 
 
-def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(
-    rooms: Path, tmp_path: Path, sphere: None
-) -> None:
+def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(rooms, tmp_path, sphere) -> None:
     out = tmp_path / "out"
     (name,) = process(rooms / "room0", out, "predict")["outputs"]
     stem = Path(name).stem
@@ -207,9 +199,7 @@ def test_files_that_a_killed_worker_left_are_removed_and_others_are_kept(
     assert set(list_outputs(out)) == {name, "room0/.gitignore"}
 
 
-def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
-    rooms: Path, tmp_path: Path, sphere: None, full_disk: Callable
-) -> None:
+def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(rooms, tmp_path, sphere, full_disk) -> None:
     out, command = tmp_path / "out", Batch(rooms, tmp_path / "out", prediction=SPHERE)
     with full_disk(100_000):
         line = process_item(("room0", rooms / "room0"), command, fingerprint_work(SPHERE))
@@ -218,9 +208,7 @@ def test_on_a_full_disk_no_half_file_is_left_and_the_item_is_done_later(
     assert process(rooms / "room0", out, "predict")["status"] == "done" and len(list_outputs(out)) == 1
 
 
-def test_without_dask_the_message_names_the_command_that_installs_it(
-    rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_dask_the_message_names_the_command_that_installs_it(rooms, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert run(["batch", str(rooms), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.endswith("run pip install 'pansplat[cluster]'\n")

@@ -89,9 +89,7 @@ def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, mon
 @pytest.mark.parametrize(
     ("command", "encoding"), [((run, "export"), "utf-8"), ((run, "export"), "ascii"), ((train, "tiny"), "utf-8")]
 )
-def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(
-    command, encoding, monkeypatch
-) -> None:
+def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(command, encoding, monkeypatch):
     """`--help-all` describes each."""
     texts = []
     for option in ("--help", "--help-all"):
@@ -161,9 +159,7 @@ REFUSED = {
 }
 
 
-def test_refused_arguments_are_one_line_with_status_2_and_write_nothing(
-    room: Path, scene: Path, tmp_path: Path, refusal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refused_arguments_are_one_line_with_status_2_and_write_nothing(room, scene, tmp_path, refusal, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PANSPLAT_LPIPS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))

@@ -42,9 +42,7 @@ def write_own(file: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(
-    room: Path, scene: Path, tmp_path: Path, name: str, refusal: Callable[..., str]
-) -> None:
+def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(room, scene, tmp_path, name: str, refusal) -> None:
     file = write_own(tmp_path / "out" / name)
     command = [part.format(room=room, scene=scene) for part in COMMANDS[name]]
     if name == "plan.png":  # the sphere of the predictor has no floor to draw
@@ -81,9 +79,7 @@ def test_the_folder_of_a_page_keeps_files_of_the_user(scene: Path, tmp_path: Pat
         ("raster.png", ["bench", "raster", "--quick"]),
     ],
 )
-def test_files_of_the_user_in_a_folder_need_overwrite(
-    room: Path, tmp_path: Path, name: str, command: list[str], refusal: Callable[..., str]
-) -> None:
+def test_files_of_the_user_in_a_folder_need_overwrite(room, tmp_path, name: str, command: list[str], refusal) -> None:
     own = write_own(tmp_path / "out" / name)
     message = refusal(*(part.format(room=room) for part in command), "-o", tmp_path / "out")
     assert f"got {own}, which pansplat did not write; choose another name, or replace them with --overwrite" in message

@@ -55,9 +55,7 @@ def estimator(monkeypatch):
     return lambda function: monkeypatch.setattr("pansplat.poses.files.estimate_poses", function)
 
 
-def test_measured_poses_are_an_error_before_the_estimate_and_replaced_with_overwrite(
-    folder: Path, estimator, capsys
-) -> None:
+def test_measured_poses_are_an_error_before_the_estimate_and_replaced_with_overwrite(folder, estimator, capsys) -> None:
     file = folder / "poses.json"
     poses = {f"{each}.png": np.eye(4).tolist() for each in "ab"}
     file.write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
@@ -165,9 +163,7 @@ WITHOUT_CACHES = {
 
 
 @pytest.mark.parametrize("linked", ["a web tour of cube faces"], indirect=True)
-def test_without_caches_no_file_is_written_to_them_or_read(
-    linked: Path, tmp_path: Path, estimator, monkeypatch
-) -> None:
+def test_without_caches_no_file_is_written_to_them_or_read(linked: Path, tmp_path, estimator, monkeypatch) -> None:
     """Poses, overlaps, the floor plan, and the descriptions of cube faces, of a folder without poses."""
     calls, cache, out = [], tmp_path / "cache", linked.parent / "out"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))

@@ -51,9 +51,7 @@ def test_a_folder_to_train_from_has_the_poses_and_gaussians_of_the_scene_where_t
         np.testing.assert_allclose(view.frame.globalize(view.cam2world), scene.frame.globalize(pose), rtol=0, atol=0.01)
 
 
-def test_an_export_into_a_folder_of_photographs_does_not_hide_them(
-    tmp_path: Path, write_room: Callable[..., Path], recwarn: pytest.WarningsRecorder
-) -> None:
+def test_an_export_into_a_folder_of_photographs_does_not_hide_them(tmp_path, write_room, recwarn) -> None:
     room = write_room(tmp_path / "room", target=False)
     out = room / "exports" / "training_set"
     assert run(["export", str(room), "-o", str(out), "--training-set", *OPTIONS]) == 0

@@ -79,9 +79,7 @@ def test_metrics_are_those_of_the_written_images(folder: Path, case: Row) -> Non
     assert case.get("cross_fade_ws_psnr") == approx_of_8_bits(ws_psnr(sum(inputs) / 2, target))
 
 
-def test_an_evaluation_does_not_use_the_prediction_cache(
-    tmp_path: Path, sphere_predictor: type, write_triplet: Callable[..., Path]
-) -> None:
+def test_an_evaluation_does_not_use_the_prediction_cache(tmp_path, sphere_predictor, write_triplet) -> None:
     pairs, predictor = load_sets(write_triplet(tmp_path / "room")), sphere_predictor()
     for _ in range(2):
         evaluate(pairs, predictor, tmp_path / "out", height=HEIGHT)

@@ -102,9 +102,7 @@ def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return places, atlas[row, column]
 
 
-def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(
-    scene: Scene, rooms: Rooms, photograph: Callable[..., list[PanoramaSet]]
-) -> None:
+def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(scene, rooms, photograph) -> None:
     house = make_house(scene, rooms, photograph())
     places, colors = _sample(house)
     walls = shapely.union_all([outline.exterior for outline in (*BOXES, PASSAGE)])
@@ -155,9 +153,7 @@ def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(rooms: Room
         assert find((5.0, 0.5, 1.45)) == [0] and find((1.5, 0.5, 0.0)) == [0]
 
 
-def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(
-    scene: Scene, rooms: Rooms, photograph: Callable[..., list[PanoramaSet]]
-) -> None:
+def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(scene, rooms, photograph) -> None:
     pairs = photograph((200, 0, 0), (0, 0, 200), (0, 200, 0))
     hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)
     screen = Gaussians.cat([scene.gaussians, make_balls(hidden, 0.03, views=0)])

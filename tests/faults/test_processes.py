@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,7 @@ EVALUATE = "evaluate pair --out report --model sphere --height 64"
 @pytest.mark.parametrize(
     ("command", "number"), [(PREDICT, signal.SIGINT), (PREDICT, signal.SIGTERM), (EVALUATE, signal.SIGINT)]
 )
-def test_a_signal_ends_a_command_quietly(
-    command: str,
-    number: signal.Signals,
-    attack: Callable[..., Any],
-    sphere_predictor: type,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_signal_ends_a_command_quietly(command, number, attack, sphere_predictor, monkeypatch) -> None:
     monkeypatch.setattr(sphere_predictor, "__call__", lambda *_, **__: signal.raise_signal(number))
     handlers = [signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM)]
     outcome = attack(command.split())

@@ -251,9 +251,7 @@ WRITTEN = {
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_file_on_a_full_disk_is_one_line_and_the_old_file_stays(
-    name: str, folder: Path, attack: Callable[..., Any], full_disk: Callable
-) -> None:
+def test_a_file_on_a_full_disk_is_one_line_and_the_old_file_stays(name: str, folder, attack, full_disk) -> None:
     assert attack([*WRITTEN[name].split(), name]).status == 0
     before = (folder / name).read_bytes()
     with full_disk(300):

@@ -192,14 +192,7 @@ def photographs(scene: Scene, take_photographs: Callable[..., list[PanoramaSet]]
 
 
 @pytest.fixture(scope="module")
-def folder(
-    scene: Scene,
-    house: Scene,
-    flat: Scene,
-    sites: Sites,
-    photographs: list[PanoramaSet],
-    take_photographs: Callable[..., list[PanoramaSet]],
-) -> Path:
+def folder(scene, house, flat, sites, photographs, take_photographs) -> Path:
     """tour.html, split.html with files, house.html with a graph, flat.html with parts.
 
     photos.html, photos/index.html and rooms.html (as flat.html) have photographs; poor/index.html has a poor edge.
@@ -364,9 +357,7 @@ POSES = [
 
 
 @pytest.mark.parametrize(("position", "yaw", "pitch", "fov"), POSES)
-def test_the_picture_is_that_of_the_rasteriser(
-    home: OpenPage, scene: Scene, position: tuple[float, ...], yaw: float, pitch: float, fov: float
-) -> None:
+def test_the_picture_is_that_of_the_rasteriser(home, scene, position, yaw, pitch, fov) -> None:
     camera = {"position": position, "yaw": yaw, "pitch": pitch, "fov": fov}
     home.run("(camera) => Object.assign(pansplat.camera, camera)", camera)
     image = home.draw()
@@ -501,9 +492,7 @@ def test_a_pose_and_a_tour_lead_out_of_the_dolls_house(chromium: Any, room_page:
         assert page.messages == []
 
 
-def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_chooses(
-    chromium: Any, folder: Path
-) -> None:
+def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_chooses(chromium, folder) -> None:
     with opened(chromium, folder / "tour.html", size=(640, 480), reduced_motion="reduce") as page:
         page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
         position, mark = page.run("[HEADER.spots[0].position, HEADER.spots[1].mark]")
@@ -532,9 +521,7 @@ def test_a_drag_that_starts_on_a_ring_or_its_label_turns_the_view_and_a_click_ch
             page.wait("pansplat.camera.position.every((x, i) => x === HEADER.spots[1].position[i])")
 
 
-def test_a_page_of_small_and_large_units_is_that_of_metres(
-    chromium: Any, folder: Path, scene: Scene, photographs: list[PanoramaSet], tmp_path: Path
-) -> None:
+def test_a_page_of_small_and_large_units_is_that_of_metres(chromium, folder, scene, photographs, tmp_path) -> None:
     seen, plans = [], []
     for unit in (1.0, 1e3, 1e-3):
         path = tmp_path / f"{unit:g}.html"
@@ -658,9 +645,7 @@ def test_no_ring_is_under_the_buttons(chromium: Any, folder: Path) -> None:
         assert found == ["", "arrow down"]
 
 
-def test_a_note_of_the_tour_is_a_marker_at_its_panorama_that_opens_plain_text(
-    chromium: Any, folder: Path, scene: Scene
-) -> None:
+def test_a_note_of_the_tour_is_a_marker_at_its_panorama_that_opens_plain_text(chromium, folder, scene) -> None:
     with opened(chromium, folder / "photos.html") as page:
         marker = page.page.locator("#spots button.note:not([hidden])")
         assert marker.count() == 0
@@ -752,9 +737,7 @@ def test_a_photograph_fades_without_a_jump(chromium: Any, folder: Path) -> None:
 
 @pytest.mark.parametrize("status", [200, 404])
 @pytest.mark.parametrize("num_failures", [2, 3])
-def test_a_tile_that_does_not_arrive_is_read_three_times_and_then_named(
-    chromium: Any, folder: Path, sites: Sites, status: int, num_failures: int
-) -> None:
+def test_a_tile_that_does_not_arrive_is_read_three_times_and_then_named(chromium, folder, sites, status, num_failures):
     """A web server may answer with a page of its own in place of a file that is missing."""
     with opened(chromium, f"{sites.pages}/photos/index.html", is_stepped=True) as page:
         page.settle()
@@ -784,9 +767,7 @@ def test_a_tile_that_does_not_arrive_is_read_three_times_and_then_named(
 
 
 @pytest.mark.parametrize("case", ["missing", "late", "left"])
-def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(
-    chromium: Any, folder: Path, case: str
-) -> None:
+def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(chromium, folder, case: str) -> None:
     """A tile of the preview is missing or late, or the camera leaves before it is there."""
     shutil.copytree(folder / "poor", folder / case)
     with opened(chromium, folder / case / "index.html", is_stepped=True) as page:
@@ -831,9 +812,7 @@ LOSE_AND_RESTORE = """async () => {
 }"""
 
 
-def test_a_folder_loads_the_tiles_that_are_needed_and_shows_them_again_after_lost_graphics(
-    chromium: Any, folder: Path
-) -> None:
+def test_a_folder_loads_the_tiles_that_are_needed_and_shows_them_again_after_lost_graphics(chromium, folder) -> None:
     with opened(chromium, folder / "photos" / "index.html") as page:
         page.settle()
         names = page.run("HEADER.photographs.map(({ name }) => name)")
@@ -963,9 +942,7 @@ def test_a_sorter_that_ends_is_reported_and_rejects_pictures(chromium: Any, fold
         ("delete window.DecompressionStream", "DecompressionStream"),
     ],
 )
-def test_what_the_browser_lacks_is_named_over_the_poster_with_browsers_that_have_it(
-    chromium: Any, folder: Path, script: str, needed: str
-) -> None:
+def test_what_the_browser_lacks_is_named_over_the_poster_with_browsers_that_have_it(chromium, folder, script, needed):
     context = new_context(chromium)
     page = context.new_page()
     page.add_init_script(script)
@@ -1033,9 +1010,7 @@ def test_the_page_works_when_the_first_view_has_arrived(chromium: Any, folder: P
 
 
 @pytest.mark.parametrize("name", ["photos.html", "photos/index.html"])
-def test_the_photograph_is_shown_before_any_gaussians_arrive(
-    chromium: Any, folder: Path, photographs: list[PanoramaSet], name: str
-) -> None:
+def test_the_photograph_is_shown_before_any_gaussians_arrive(chromium, folder, photographs, name: str) -> None:
     with opened(chromium, folder / name, script=WITHOUT_GAUSSIANS, is_stepped=True) as page:  # and is ready
         node, start, level = page.run("HEADER.loading[0]"), page.camera["position"], np.array(page.run("HEADER.level"))
         page.run("pansplat.setPose({ yaw: 30, pitch: 10 })")
@@ -1120,9 +1095,7 @@ def test_a_file_that_does_not_arrive_is_read_again(chromium: Any, folder: Path, 
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_part_that_does_not_arrive_ends_no_page_and_is_shown_when_it_does(
-    chromium: Any, folder: Path, faulty: str, fault: str
-) -> None:
+def test_a_part_that_does_not_arrive_ends_no_page_and_is_shown_when_it_does(chromium, folder, faulty, fault) -> None:
     files, _ = list_files(folder / "hosted.html")
     FaultyHandler.faults[files[2]] = [fault] * 4
     with opened(chromium, f"{faulty}/hosted.html", script=FAST) as page:
@@ -1139,9 +1112,7 @@ def test_a_part_that_does_not_arrive_ends_no_page_and_is_shown_when_it_does(
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_tile_that_does_not_arrive_does_not_delay_the_gaussians(
-    chromium: Any, folder: Path, faulty: str, fault: str
-) -> None:
+def test_a_tile_that_does_not_arrive_does_not_delay_the_gaussians(chromium, folder, faulty, fault: str) -> None:
     _, tiles = list_files(folder / "photos" / "index.html")
     FaultyHandler.faults |= {tile: [fault] * 9 for tile in tiles}
     endless = STAY.replace("5000", "10000")  # silence
@@ -1284,9 +1255,7 @@ def test_a_page_of_parts_fades_along_a_link_and_lists_all_panoramas(chromium: An
         assert page.messages == []
 
 
-def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panorama(
-    chromium: Any, folder: Path
-) -> None:
+def test_along_a_poor_edge_the_image_grows_and_fades_fast_into_that_of_the_panorama(chromium, folder) -> None:
     with opened(chromium, folder / "house.html", script=FRAMES) as page:
         page.settle()
         spots = page.run("HEADER.spots.map(({ position }) => position)")
@@ -1380,9 +1349,7 @@ def test_the_keys_that_open_a_dialog_close_it(home: OpenPage) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(195, 422), (420, 240), (300, 270)])
-def test_the_poster_is_in_place_of_the_picture(
-    chromium: Any, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
-) -> None:
+def test_the_poster_is_in_place_of_the_picture(chromium, scene, tmp_path, monkeypatch, size: tuple[int, int]) -> None:
     monkeypatch.setattr(page_module, "_POSTER_SIZE", (486, 576))
     write_page(scene, tmp_path / "page.html")
     with opened(chromium, tmp_path / "page.html", size=size) as page:
@@ -1777,9 +1744,7 @@ def in_level(page: OpenPage, vector: Any) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["tour.html", "photos.html"])
-def test_both_eyes_see_the_pictures_of_the_rasteriser(
-    chromium: Any, folder: Path, scene: Scene, iwer: str, name: str
-) -> None:
+def test_both_eyes_see_the_pictures_of_the_rasteriser(chromium, folder, scene, iwer, name: str) -> None:
     origin = scene.cam2world[:, :3, 3].mean(0).numpy()
     with in_headset(chromium, folder / name, iwer) as page:
         level = np.array(page.run("HEADER.level"))
@@ -1942,9 +1907,7 @@ def test_both_eyes_see_the_photograph_where_there_are_no_gaussians(chromium: Any
 
 
 @pytest.mark.parametrize(("script", "height"), [("", 0.5), ("device.supportedFeatures.splice(2, 1);", 1.6)])
-def test_without_a_floor_of_the_same_height_the_head_begins_at_the_camera(
-    chromium: Any, folder: Path, iwer: str, script: str, height: float
-) -> None:
+def test_without_a_floor_of_the_same_height_the_head_begins_at_the_camera(chromium, folder, iwer, script, height):
     with in_headset(chromium, folder / "tour.html", iwer, script, (0.1, height, -0.2)) as page:
         start = page.run("HEADER.spots[HEADER.walk[0]]")
         assert page.camera["position"] == pytest.approx(start["position"], abs=1e-6)
@@ -2063,9 +2026,7 @@ def test_the_resolution_follows_the_time_between_frames(chromium: Any, folder: P
 
 
 @pytest.mark.slow
-def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it_and_saves_pictures(
-    chromium: Any, plain_scene: Scene, tmp_path: Path
-) -> None:
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it_and_saves_pictures(chromium, plain_scene, tmp_path):
     file = tmp_path / "cell.html"
     file.write_text(f"<!doctype html><meta charset=utf-8>{_bundle_scene(plain_scene)['text/html']}")
     page = OpenPage(new_context(chromium, viewport={"width": 640, "height": 560}).new_page())

@@ -289,9 +289,7 @@ def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp
     assert steps[0] == pytest.approx(0.05) and steps[-1] < 0.005
 
 
-def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it_there(
-    node: str, tmp_path: Path
-) -> None:
+def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it_there(node, tmp_path) -> None:
     header = make_header(ROW, [(0, 1), (1, 2), (3, 3)], [0, 0, 0, 1]) | {"poor": [(0, 1)]}
     walked = f"""(position) => {{
         {SORTED}
@@ -313,9 +311,7 @@ def test_a_camera_stops_half_a_metre_along_a_poor_edge_but_a_script_may_place_it
 
 
 @pytest.mark.parametrize("edges", [[], [(0, 1), (1, 2), (3, 3)]])
-def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(
-    edges: list[tuple[int, int]], node: str, tmp_path: Path
-) -> None:
+def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(edges, node, tmp_path) -> None:
     """The surfaces around the first panorama are 0.6 m away, but those ahead 1.4 m."""
     parts = [0, 0, 0, 1] if edges else [0] * 4
     header = make_header(ROW, edges, parts)

@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,6 @@ from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
 from pansplat.geometry.world import WorldFrame
-from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.refinement.budget import merge_to
 from pansplat.system.atomic import replacing
 from pansplat.tours import edges
@@ -206,9 +205,7 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     assert sorted(header["walk"]) == [0, 1, 2, 3] and header["walk"][0] == 0
 
 
-def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(
-    flat: Scene, tmp_path: Path, take_photographs: Callable[..., list[PanoramaSet]]
-) -> None:
+def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(flat, tmp_path, take_photographs) -> None:
     photographs = take_photographs(flat, 64)
     write_page(flat, tmp_path / "tour.html", photographs=photographs)
     header = read_header(tmp_path / "tour.html")
@@ -220,9 +217,7 @@ def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(
 
 
 @pytest.mark.parametrize(("size", "limit"), [(1.0, 1.0), (0.5, 0.62)])
-def test_the_camera_stays_within_a_metre_of_a_single_photograph(
-    scene: Scene, tmp_path: Path, size: float, limit: float
-) -> None:
+def test_the_camera_stays_within_a_metre_of_a_single_photograph(scene, tmp_path, size: float, limit: float) -> None:
     single = select_views(scene, (1,))  # its surfaces are 2 to 3 m away
     center = single.cam2world[0, :3, 3].float()
     gaussians = dataclasses.replace(single.gaussians, means=center + size * (single.gaussians.means - center))
@@ -337,9 +332,7 @@ def test_merged_gaussians_of_a_scene_whose_views_are_unknown_keep_their_image(pl
 @pytest.mark.parametrize(
     ("address", "base"), [(None, ""), ("https://a.b/home", "https://a.b/home/"), ("https://a.b/t.html", "https://a.b/")]
 )
-def test_a_folder_has_what_previews_of_links_show(
-    plain_scene: Scene, tmp_path: Path, address: str | None, base: str
-) -> None:
+def test_a_folder_has_what_previews_of_links_show(plain_scene, tmp_path, address: str | None, base: str) -> None:
     page = write_page(plain_scene, tmp_path / "index.html", split=True, title='My "home"', address=address)
     found = dict(re.findall(r'<meta (?:name|property)="(.*?)" content="(.*?)">', page.files[0].read_text()))
     assert found["og:title"] == "My &quot;home&quot;"
@@ -374,9 +367,7 @@ def test_the_parts_of_a_split_page_replace_the_old_ones(scene: Scene, tmp_path: 
 
 
 @pytest.mark.parametrize("is_shared", [False, True])
-def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(
-    scene: Scene, tmp_path: Path, is_shared: bool
-) -> None:
+def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(scene, tmp_path, is_shared: bool) -> None:
     """`is_shared`: a user's file is beside the parts."""
     write_page(scene, tmp_path / "tour.html", split=True)
     other = tmp_path / "tour_files" / "0123456789abcdef.bin"
@@ -389,9 +380,7 @@ def test_a_page_in_one_file_removes_the_parts_of_the_split_one_before(
 
 
 @pytest.mark.parametrize("at", ["first part", "last part"])
-def test_an_export_that_ends_during_another_one_removes_none_of_its_parts(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
-) -> None:
+def test_an_export_that_ends_during_another_one_removes_none_of_its_parts(scene, tmp_path, monkeypatch, at) -> None:
     path, counts = tmp_path / "tour.html", []
     write_page(scene, path, split=True)
 
@@ -432,9 +421,7 @@ def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Pat
         assert unquote_to_bytes(place.path) == b"/folder/" + os.fsencode(f"{stem}_files/{file.name}")
 
 
-def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussians(
-    scene: Scene, take_photographs: Callable[..., list[PanoramaSet]], tmp_path: Path
-) -> None:
+def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussians(scene, take_photographs, tmp_path):
     write_page(scene, tmp_path / "tour.html", photographs=take_photographs(scene, 1024))
     header = read_header(tmp_path / "tour.html")
     first, *others = header["loading"]
@@ -461,9 +448,7 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(scene: Scene, tmp_path: Pat
     assert written.num_gaussians == len(scene.gaussians) - 3
 
 
-def test_large_pages_have_a_lower_degree_of_harmonics(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_pages_have_a_lower_degree_of_harmonics(scene, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(page_module, "_TARGET_BYTES", 32 * len(scene.gaussians))
     assert read_header(write_page(scene, tmp_path / "tour.html").files[0])["degree"] == 0
 
@@ -475,9 +460,7 @@ def test_a_page_of_another_unit_is_that_of_metres_but_for_the_lengths_it_shows(f
     assert (metres.pop("unit"), millimetres.pop("unit")) == (1.0, 1e-3) and metres == millimetres
 
 
-def test_pages_that_cannot_be_drawn_or_written_are_refused(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pages_that_cannot_be_drawn_or_written_are_refused(scene, tmp_path, monkeypatch) -> None:
     empty = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
     monkeypatch.setattr(page_module, "MAX_FILE_BYTES", 60_000)
     for given, name, options, message in (

@@ -87,9 +87,7 @@ def test_what_is_no_address_is_a_bad_request(server: PageServer, capfd: pytest.C
     assert get(server, "/")[0] == 200 and capfd.readouterr() == ("", "")
 
 
-def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(
-    server: PageServer, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(server, capfd) -> None:
     port = server.server_address[1]
     with socket.create_connection(("127.0.0.1", port)), socket.create_connection(("127.0.0.1", port)) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\n\r\n")
