@@ -3,7 +3,6 @@
 import base64
 import dataclasses
 import io
-import json
 import math
 import re
 from pathlib import Path
@@ -13,10 +12,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
 from PIL import Image
 
-from pansplat.export import page as page_module
+from pansplat.evaluation.metrics import psnr
 from pansplat.export import photographs as module
 from pansplat.export.page import write_page
 from pansplat.export.photographs import PackedPhotograph, label_files, pack_photographs, read_photograph
@@ -27,11 +25,6 @@ from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, is_written
 
 PURPLE = (200, 0, 200)  # of what masks hide; nothing else has so little green
-
-
-@pytest.fixture(autouse=True)
-def small_poster(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
 
 
 def count_purple(pixels: np.ndarray) -> int:
@@ -90,10 +83,6 @@ def decode_page(path: Path) -> list[np.ndarray]:
     return pictures
 
 
-def psnr(a: Float[np.ndarray, "..."], b: Float[np.ndarray, "..."]) -> float:
-    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12))
-
-
 def pack(scene: Scene, photographs: list[PanoramaSet], **options: Any) -> list[PackedPhotograph]:
     arguments = {"num_bytes": math.inf, "height": None} | options
     return pack_photographs(scene, photographs, **arguments)
@@ -124,8 +113,8 @@ def test_the_tiles_of_the_largest_level_are_the_photograph(scene, take_photograp
         for level, least in ((0, 34), (1, 38)):
             faces = decode_faces(packed, level)
             assert faces[0].shape == (packed.levels[level][0],) * 2 + (3,)
-            seen = equirect_from_faces(faces, 1024) / 255
-            assert psnr(seen, image.permute(1, 2, 0).numpy()) > least
+            seen = torch.from_numpy(equirect_from_faces(faces, 1024) / 255).permute(2, 0, 1)
+            assert psnr(seen, image) > least
         assert np.allclose(packed.rotation, scene.cam2world[view, :3, :3])
 
 
@@ -205,9 +194,6 @@ def test_photographs_fit_into_the_bytes_or_have_the_stated_height(scene, take_ph
 def test_a_new_page_removes_the_tiles_of_the_old_one(plain_scene, tmp_path, take_photographs) -> None:
     photographs = take_photographs(plain_scene, 64)
     first = write_page(plain_scene, tmp_path / "index.html", split=True, photographs=photographs)
-    header = json.loads(re.findall(r"^const HEADER = (.*);$", first.files[0].read_text(), flags=re.MULTILINE)[0])
-    assert header["folder"] == "index_files" and len(header["photographs"]) == 2
-    assert len(first.files) == 1 + 2 + 2 * 6 + 1 and all(file.is_file() for file in first.files)
-    assert all(is_written(file) for file in first.files)
+    assert len(first.files) == 1 + 2 + 2 * 6 + 1 and all(is_written(file) for file in first.files)
     second = write_page(plain_scene, tmp_path / "index.html", split=True)
     assert second.photo_height == 0 and set((tmp_path / "index_files").iterdir()) == set(second.files[1:])
