@@ -16,9 +16,6 @@ PREDICT = "predict pair -o out.ply --model sphere --height 64 --refine 0"
 EVALUATE = "evaluate pair --out report --model sphere --height 64"
 
 
-# Signals, in this process
-
-
 @pytest.mark.parametrize(
     ("command", "number"), [(PREDICT, signal.SIGINT), (PREDICT, signal.SIGTERM), (EVALUATE, signal.SIGINT)]
 )
@@ -98,9 +95,8 @@ class Cases:
 
     def run(self) -> list[str]:
         """Run all cases; returns what is wrong."""
-        done = subprocess.run(
-            [sys.executable, "-c", _FORK_SERVER], input=json.dumps(self.cases), capture_output=True, text=True
-        )
+        command = [sys.executable, "-c", _FORK_SERVER]
+        done = subprocess.run(command, input=json.dumps(self.cases), capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         wrong = []
         for case, status in zip(self.cases, map(int, done.stdout.split()), strict=True):

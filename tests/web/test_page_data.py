@@ -104,8 +104,6 @@ def test_extreme_numbers_are_packed(scene: Scene) -> None:
     planes = read_planes(pack_gaussians(extreme, np.zeros(3), (0,), 1))
     quats = read_quats(planes[15:19])
     for k in range(3):
-        assert (
-            np.isfinite(join(planes[3 * k : 3 * k + 3])).all()
-            and np.isfinite(join(planes[9 + 2 * k : 11 + 2 * k])).all()
-        )
+        assert np.isfinite(join(planes[3 * k : 3 * k + 3])).all()
+        assert np.isfinite(join(planes[9 + 2 * k : 11 + 2 * k])).all()
     assert np.isfinite(quats).all() and np.allclose(np.linalg.norm(quats, axis=1), 1)
