@@ -47,14 +47,8 @@ def _render_room(cam2world: torch.Tensor) -> torch.Tensor:
 
 
 def _views(*poses: torch.Tensor, near: float = 0.45, far: float = 10.0) -> Views:
-    return Views(
-        torch.stack([_render_room(pose) for pose in poses]),
-        torch.stack(poses),
-        torch.ones(len(poses), _HEIGHT, 2 * _HEIGHT, dtype=torch.bool),
-        near,
-        far,
-        tuple("abc"[: len(poses)]),
-    )
+    images, masks = torch.stack([_render_room(pose) for pose in poses]), torch.ones(len(poses), _HEIGHT, 2 * _HEIGHT)
+    return Views(images, torch.stack(poses), masks.bool(), near, far, tuple("abc"[: len(poses)]))
 
 
 _TILTED = (_pose((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)), _pose((0.6, -0.15, -0.6, 0.1), (-0.5, -0.2, 0.5)))

@@ -167,24 +167,17 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
     positions[40:] = random.uniform((3, -0.5, -1), (11, 0.5, 11), (20, 3))
     nodes, current = range(len(places)), random.integers(len(edges), size=60)
     starts = positions + random.uniform(-0.4, 0.4, (60, 3))
-    found = run(
-        node,
-        tmp_path,
-        make_header(),
-        """(graph, positions, current, starts) => positions.map((position, i) => ({
-            nearest: graph.edges[nearestEdge(graph, position)],
-            ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
-            followed: graph.edges[followEdge(graph, position, current[i])],
-            ways: graph.positions.map((_, node) => findWay(graph, position, node)),
-            waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
-            fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
-            step: limitStep(graph, starts[i], position),
-        }))""",
-        graph,
-        positions.tolist(),
-        current.tolist(),
-        starts.tolist(),
-    )
+    program = """(graph, positions, current, starts) => positions.map((position, i) => ({
+        nearest: graph.edges[nearestEdge(graph, position)],
+        ofPart: graph.edges[nearestEdge(graph, position, partOfEdge(graph, current[i]))],
+        followed: graph.edges[followEdge(graph, position, current[i])],
+        ways: graph.positions.map((_, node) => findWay(graph, position, node)),
+        waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
+        fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+        step: limitStep(graph, starts[i], position),
+    }))"""
+    values = (graph, positions.tolist(), current.tolist(), starts.tolist())
+    found = run(node, tmp_path, make_header(), program, *values)
     for position, number, case in zip(positions, current, found, strict=True):
         edge = edges[number]
         assert tuple(case["nearest"]) == tour.find_nearest_edge(position)[0]
