@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-
 from pansplat.gaussians.scene import Gains, Gaussians
 from pansplat.inputs.content import hash_context
 from pansplat.inputs.panorama_sets import PanoramaSet
@@ -14,8 +12,6 @@ from pansplat.prediction_options import PredictOptions
 from pansplat.predictor import Predictor
 from pansplat.refinement import RefineConfig, refinement_fingerprint
 from pansplat.system.store import Store, hash_parts
-
-_MAX_LEVELS = 256  # levels of Gaussians that an entry can have; their labels are bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,27 +48,9 @@ class CachedPrediction:
 
     def read(self) -> CachedScene | None:
         """The content; None if there is none."""
-        count = 0 if self._pair is None else len(self._pair.context)
-        return self._store.read(self._kind, self._key, lambda content: _is_valid(content, count))
+        return self._store.read(self._kind, self._key)
 
     def write(self, content: CachedScene) -> None:
         """Write the content, unless a file has changed since the key was made."""
         if self._make_key() == self._key:
             self._store.write(self._kind, self._key, content)
-
-
-def _is_valid(content: object, num_views: int) -> bool:
-    """Whether an entry holds values that predictors write; others would be wrong indices of views and levels."""
-    if not isinstance(content, CachedScene):
-        return False
-    gaussians, gains = content.gaussians, torch.tensor(content.gains, dtype=torch.float64)
-    floats = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.harmonics)
-    if not all(value.is_floating_point() and bool(value.isfinite().all()) for value in floats):
-        return False
-    for label, count in ((gaussians.levels, _MAX_LEVELS), (gaussians.views, num_views)):
-        if label.is_floating_point() or label.is_complex() or label.dtype == torch.bool:
-            return False
-        if len(label) and not 0 <= int(label.min()) <= int(label.max()) < count:
-            return False
-    has_gains = gains.shape == (num_views, 3) and bool((gains.isfinite() & (gains > 0)).all())
-    return has_gains or not content.gains

@@ -18,7 +18,7 @@ from PIL import Image
 
 from pansplat import pipeline
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import turn_axes
+from pansplat.geometry.level import turn_axes
 
 SIZE = (320, 240)
 LIMIT = 180  # seconds, after which a state that the page does not reach is an error

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import re
 import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,6 @@ import torch
 from panorama_formats import EXAMPLES, Example, write_picture, write_room
 from PIL import Image
 
-from pansplat.cache import CachedScene, _is_valid
 from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
@@ -34,7 +32,6 @@ from pansplat.model.pansplat import PanSplatConfig
 from pansplat.networks.weights import WeightsFile, load_weights, read_checkpoint
 from pansplat.pipeline import render
 from pansplat.system.files import SCENE_SUFFIXES
-from pansplat.system.store import Store, _pack
 from pansplat.system.strict_json import read_json
 from pansplat.tours.camera_path import read_path
 from pansplat.training.checkpoint import load_checkpoint
@@ -224,21 +221,6 @@ def _make_official(folder: Path) -> InputFile:
     return InputFile(folder / "official.ckpt", _whole(read_checkpoint))
 
 
-def _make_cached(folder: Path) -> InputFile:
-    """An entry of the cache, whose checksum is valid whatever else changes."""
-    types = {each.__name__: each for each in (CachedScene, Gaussians)}
-    (folder / "cached.entry").write_bytes(_pack(CachedScene(SCENE.gaussians), types))
-
-    def read(path: Path) -> str:
-        body = path.read_bytes()[:-4]
-        path.write_bytes(body + zlib.crc32(body).to_bytes(4, "little"))
-        if Store(None, tuple(types.values()))._open(path, lambda content: _is_valid(content, 2)) is None:
-            raise InputError(f"{path}: it is predicted again")
-        return ""
-
-    return InputFile(folder / "cached.entry", read)
-
-
 def _make_image(folder: Path, suffix: str) -> InputFile:
     if suffix == ".exr":
         write_image(folder / "image.exr", np.random.default_rng(0).integers(0, 255, (8, 16, 3), np.uint8))
@@ -285,7 +267,6 @@ FILES: dict[str, Callable[[Path], InputFile]] = {
     "weights": _make_weights,
     "training checkpoint": _make_checkpoint,
     "official checkpoint": _make_official,
-    "cache": _make_cached,
     **{
         f"image{suffix}": lambda folder, suffix=suffix: _make_image(folder, suffix)
         for suffix in (".png", ".jpg", ".webp", ".tif", ".exr")

@@ -18,13 +18,13 @@ from pansplat.system.files import expand_home, require_output_folder, require_re
 from pansplat.system.options import check_numbers
 from pansplat.system.progress import stage
 from pansplat_viewer.core.loader import (
-    LoadedScene,
     SceneEntry,
     SceneLoader,
     ShowEntries,
     choose_entry,
     find_entries,
     load_entry,
+    load_whole,
 )
 from pansplat_viewer.core.settings import DrawSettings, RendererChoice
 
@@ -204,31 +204,20 @@ def _write_film(options: Options, entry: SceneEntry, folder: Path, pixels: tuple
 
     Names of scenes and files are printed as soon as they are there.
     """
+    from pansplat.tours.facts import TourFacts
     from pansplat_viewer.capture import open_film, write_flight
-    from pansplat_viewer.core.state import fit_settings
-    from pansplat_viewer.core.tour_scenes import TourScenes
     from pansplat_viewer.draw.cpu_renderer import create_renderer
 
     ctx = _create_context(options.renderer)  # before the prediction, so that missing OpenGL is reported early
     with progress_bar():
-
-        def load(entry: SceneEntry, end: float = 0.0) -> LoadedScene:  # 0: within the frames of the film
-            with stage(end, f"{entry.name}: "):
-                loaded = load_entry(entry, options.prediction)
-            name = loaded.entry.pair.name if loaded.entry.pair is not None else entry.name
-            print(f"{name}: {len(loaded.scene.gaussians):,} Gaussians", flush=True)
-            return loaded
-
-        def show_file(file: Path) -> None:
-            print(file, flush=True)
-
-        loaded = load(entry, _PREDICTION_PART)
-        settings = fit_settings(_SETTINGS, loaded.scene)
-        scenes = None if loaded.entry.tour is None else TourScenes.start(loaded)
+        with stage(_PREDICTION_PART, f"{entry.name}: "):
+            scene, source = load_whole(entry, options.prediction)
+        print(f"{entry.name}: {len(scene.gaussians):,} Gaussians", flush=True)
+        facts = TourFacts(scene, folder=None if source is None else source.folder)
         create = partial(create_renderer, ctx, options.renderer, color_bits=32)
         try:
-            with open_film(create, loaded, scenes, load, pixels, settings) as film:
-                write_flight(film, loaded, scenes, folder, options.fps, options.seconds, show_file)
+            with open_film(create, scene, source, pixels, _SETTINGS) as film:
+                write_flight(film, facts, folder, options.fps, options.seconds, partial(print, flush=True))
         finally:
             if ctx is not None:
                 ctx.release()

@@ -15,7 +15,7 @@ import torch
 
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
-from pansplat.geometry.path import find_direction
+from pansplat.geometry.level import find_direction
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.merge import list_starts
 from pansplat.tours.route import REST_SECONDS, Route

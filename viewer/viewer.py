@@ -23,7 +23,7 @@ from imgui_bundle import imgui
 
 from pansplat import pipeline
 from pansplat.errors import InputError
-from pansplat.geometry.path import find_direction
+from pansplat.geometry.level import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.panorama_sets import Note
 from pansplat.inputs.photographs import read_notes, write_notes

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from pansplat.cli.export import Export, Page
-from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction, list_panoramas
+from pansplat.cli.inputs import Computation, Out, PairChoice, ScenePrediction
 from pansplat.cli.predict import Predict
 from pansplat.errors import InputError, collect_notes
 from pansplat.prediction_options import PredictOptions, ReadOptions, choose_caches
@@ -156,8 +156,7 @@ class Batch(Computation):
         tours = find_tours(pairs)
         images = {panorama.image for tour in tours for panorama in tour.panoramas}
         for source in (*tours, *(pair for pair in pairs if pair.context[0].image not in images)):
-            panoramas = list_panoramas(source)
-            content = hash_pixels(panoramas, source.siblings), *map(hash_panorama, panoramas)
+            content = hash_pixels(source.panoramas, source.siblings), *map(hash_panorama, source.panoramas)
             edges = () if isinstance(source, PanoramaSet) else describe_tour(source).overlaps
             for step in (step for step in STEPS if step in self.steps):
                 options = self.prediction

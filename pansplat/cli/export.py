@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Computation, Out, ScenePrediction, list_panoramas
+from pansplat.cli.inputs import Computation, Out, ScenePrediction
 from pansplat.errors import InputError
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count, list_first
@@ -29,7 +29,7 @@ from pansplat.system.files import (
     require_replaceable,
 )
 from pansplat.system.options import Count, Real
-from pansplat.system.progress import stage
+from pansplat.system.progress import report_progress, stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
@@ -226,7 +226,7 @@ class _TrainingSet:
             gaussians = gaussians.select(chosen.sort().values)
         views = [
             dataclasses.replace(panorama, cam2world=pose)
-            for panorama, pose in zip(list_panoramas(source), scene.frame.globalize(scene.cam2world), strict=True)
+            for panorama, pose in zip(source.panoramas, scene.frame.globalize(scene.cam2world), strict=True)
         ]
         means = scene.frame.globalize_places(gaussians.means).cpu().numpy()
         colors = make_colors(gaussians).cpu().numpy()
@@ -353,17 +353,25 @@ class Export(Computation):
         """The scene with the Gaussians and harmonics that are wanted; what is left out is printed."""
         import torch
 
-        from pansplat.export.cleanup import clean_up
+        from pansplat.export.floaters import remove_floaters
+        from pansplat.gaussians.crop import crop
         from pansplat.gaussians.scene import prune
 
-        box = self.crop
-        if box is not None:
-            corners = torch.tensor(box, dtype=torch.float64).reshape(2, 3)
+        steps: dict[str, Callable[[Scene], Scene]] = {}
+        if self.crop is not None:
+            corners = torch.tensor(self.crop, dtype=torch.float64).reshape(2, 3)
             box = tuple(scene.frame.localize_places(corners).flatten().tolist())
-        try:
-            scene, changes = clean_up(scene, box, floaters=not self.remove_floaters)
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from error
-        for change in changes:
-            print(change)
+            steps["crop"] = lambda scene: crop(scene, box)
+        if self.remove_floaters:
+            steps["floaters"] = remove_floaters
+        for name, step in steps.items():
+            report_progress(name, 0.9)
+            count, cameras = len(scene.gaussians), len(scene.cam2world)
+            try:
+                scene = step(scene)
+            except InputError as error:
+                raise InputError(f"{self.path}: {error}") from error
+            left, cameras_left = count - len(scene.gaussians), cameras - len(scene.cam2world)
+            cameras_out = f", and {cameras_left} of {describe_count(cameras, 'camera')}" if cameras_left else ""
+            print(f"{name}: {left:,} of {count:,} Gaussians left out{cameras_out}")
         return dataclasses.replace(scene, gaussians=prune(scene.gaussians, degree=self.degree))

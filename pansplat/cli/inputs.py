@@ -23,7 +23,7 @@ from pansplat.system.progress import CONNECTED, POSED, stage
 
 if TYPE_CHECKING:
     from pansplat.gaussians.scene import Scene
-    from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
+    from pansplat.inputs.panorama_sets import PanoramaSet
     from pansplat.tours.graph import TourGraph
 
 Out = Annotated[Path, arg(aliases=["-o"])]
@@ -96,7 +96,7 @@ class ScenePrediction:
             return pipeline.load(path), None
         source, count = choose_source(path, self.choice), None
         if choose_count is not None:
-            count = choose_count([read_height(view.image) for view in list_panoramas(source)])
+            count = choose_count([read_height(view.image) for view in source.panoramas])
         return pipeline.predict(source, options=replace(self.options, gaussians=count, joint=joint)), source
 
 
@@ -118,13 +118,6 @@ def choose_source(path: Path, choice: PairChoice) -> PanoramaSet | TourGraph:
     print(f"note: {path}: a tour of {count} ({kinds}--pair chooses one pair){more}", file=sys.stderr)
     with stage(CONNECTED):
         return connect(tours[0])
-
-
-def list_panoramas(source: PanoramaSet | TourGraph) -> tuple[Panorama, ...]:
-    """The panoramas of a pair or tour, in the order of its scene."""
-    from pansplat.inputs.panorama_sets import PanoramaSet
-
-    return source.context if isinstance(source, PanoramaSet) else source.panoramas
 
 
 def choose_set(path: Path, choice: PairChoice) -> PanoramaSet:

@@ -10,7 +10,7 @@ from typing import Annotated
 from msgspec import Meta
 from tyro.conf import Positional
 
-from pansplat.cli.inputs import Computation, Out, PairChoice, choose_source, list_panoramas
+from pansplat.cli.inputs import Computation, Out, PairChoice, choose_source
 from pansplat.prediction_options import PredictOptions
 from pansplat.system.console import progress_bar
 from pansplat.system.descriptions import describe_count
@@ -45,6 +45,6 @@ class Predict(Computation):
         source = choose_source(self.path, self.choice)
         began, options = time.perf_counter(), replace(self.prediction, joint=not self.layers)
         count = pipeline.predict_to_file(source, self.out, options=options, degree=self.degree)
-        seconds, views = time.perf_counter() - began, describe_count(len(list_panoramas(source)), "panorama")
+        seconds, views = time.perf_counter() - began, describe_count(len(source.panoramas), "panorama")
         print(f"{self.out}: {count:,} Gaussians of {views} in {seconds:.1f} s")
         return 0

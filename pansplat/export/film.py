@@ -18,7 +18,7 @@ from torch import Tensor
 from pansplat.export.photographs import list_photographs, load_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
-from pansplat.geometry.path import level_axes
+from pansplat.geometry.level import level_axes
 from pansplat.images.panorama_metadata import Stereo
 from pansplat.images.video import write_video
 from pansplat.inputs.panorama_sets import PanoramaSet
@@ -29,6 +29,7 @@ from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.limits import follow_edge
+from pansplat.tours.links import link_parts
 from pansplat.tours.merge import make_graph, select_views
 from pansplat.tours.route import REST_SECONDS, STOP_REACH, Moment, Route, find_offset, plan_route
 from pansplat.tours.scene_views import choose_scene_views
@@ -74,10 +75,9 @@ class FilmPhotographs:
     @staticmethod
     def open(source: PanoramaSet | TourGraph, scene: Scene) -> FilmPhotographs:
         """The photographs that a scene, or all scenes of a tour, are predicted from."""
-        panoramas = source.context if isinstance(source, PanoramaSet) else source.panoramas
-        poses = torch.stack([panorama.cam2world for panorama in panoramas])
-        gains = scene.gains if scene.joint and len(scene.cam2world) == len(panoramas) else ()
-        return FilmPhotographs(list_photographs(source, range(len(panoramas))), poses, gains)
+        poses = torch.stack([panorama.cam2world for panorama in source.panoramas])
+        gains = scene.gains if scene.joint and len(scene.cam2world) == len(poses) else ()
+        return FilmPhotographs(list_photographs(source, range(len(poses))), poses, gains)
 
     def find_stop(self, pose: Pose) -> tuple[int | None, float]:
         """The photograph at whose panorama a camera is, and its weight, which falls beyond `STOP_REACH`."""
@@ -145,7 +145,8 @@ def plan_visits(facts: TourFacts) -> Route:
     """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
     outlooks = dict(enumerate(facts.outlooks))
     if facts.scene.tour is not None:
-        return plan_route(facts.tour, plan_walk(facts.tour), rest=REST_SECONDS, outlooks=outlooks)
+        tour = link_parts(replace(facts.tour, poor=facts.poor))
+        return plan_route(tour, plan_walk(tour), rest=REST_SECONDS, outlooks=outlooks)
     tour = facts.tour.with_all_edges()
     return plan_route(tour, range(len(tour)), rest=REST_SECONDS, outlooks=outlooks)
 

@@ -45,7 +45,7 @@ from pansplat.export.page_data import (
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, label_files, pack_photographs
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.scene import Gaussians, Scene, prune
-from pansplat.geometry.path import find_direction, turn_axes
+from pansplat.geometry.level import find_direction, turn_axes
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.inputs.views import Views
 from pansplat.refinement import DISPLAY_HEIGHT, RefineConfig, Refinement

@@ -11,11 +11,10 @@ import ssl
 import sys
 import tempfile
 from contextlib import suppress
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote_to_bytes, urlsplit
+from urllib.parse import unquote_to_bytes
 
 from pansplat.export.page import PageFiles
 from pansplat.system.console import can_print
@@ -41,8 +40,8 @@ class PageServer(socketserver.ThreadingMixIn, socketserver.TCPServer):
 
     def __init__(self, page: PageFiles) -> None:
         folder = page.files[0].parent
-        self.files = {b"/" + os.fsencode(file.relative_to(folder).as_posix()): file for file in page.files}
-        self.files[b"/"] = page.files[0]
+        self.files = {b"/" + os.fsencode(file.relative_to(folder).as_posix()): str(file) for file in page.files}
+        self.files[b"/"] = str(page.files[0])
         address = find_address()
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         with tempfile.TemporaryDirectory() as temporary:
@@ -63,39 +62,22 @@ class PageServer(socketserver.ThreadingMixIn, socketserver.TCPServer):
             super().handle_error(request, client_address)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(SimpleHTTPRequestHandler):
     """Answers GET and HEAD."""
 
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "pansplat", ""
+    extensions_map = _TYPES
     timeout = _TIMEOUT
     server: PageServer
 
-    def do_GET(self) -> None:
-        content = b""
-        try:
-            file = self.server.files.get(unquote_to_bytes(urlsplit(self.path).path))
-        except ValueError:  # no address
-            self.send_error(HTTPStatus.BAD_REQUEST)
-            return
-        if file is not None:
-            with suppress(OSError):
-                content = file.read_bytes()
-        if file is None or not content:
-            self.send_error(HTTPStatus.NOT_FOUND)
-            return
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", _TYPES[file.suffix.lower()])
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        if self.command == "GET":
-            self.wfile.write(content)
-
-    do_HEAD = do_GET
+    def translate_path(self, path: str) -> str:
+        """The file of the page at an address; elsewhere none, which is answered by "not found"."""
+        return self.server.files.get(unquote_to_bytes(path.partition("?")[0]), "")
 
     def end_headers(self) -> None:
-        """Of every answer: no other page may frame it, and its type is the stated one."""
+        """Of every answer: no other page may frame it, its type is the stated one, and it is not kept."""
+        self.send_header("Cache-Control", "no-store")
         self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
         self.send_header("X-Content-Type-Options", "nosniff")
         super().end_headers()

@@ -32,8 +32,6 @@ from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.linked_rooms import turn_plan
 from pansplat.tours.plan import Plan, Room
 
-SUFFIXES = (".svg", ".png")
-
 _PAPER = 0.02  # metres of paper for a metre of the plan: 1:50
 _INCH = 0.0254  # metres
 _POINTS = 72 * _PAPER / _INCH  # points of paper for a metre of the plan
@@ -104,11 +102,9 @@ def write_plan(scene: Scene, path: str | Path, folder: Path | None = None) -> Pl
             "export a folder of upright panoramas of rooms"
         )
     path = Path(path)
-    if (suffix := path.suffix.lower()) not in SUFFIXES:
-        raise InputError(f"cannot write {path}: needed a name ending in {', '.join(SUFFIXES)}; rename it")
     drawing = _Drawing(plan)
     with replacing(path) as partial:
-        partial.write_bytes(_draw_figure(drawing, suffix[1:]))
+        partial.write_bytes(_draw_figure(drawing, path.suffix[1:].lower()))
     return plan
 
 

@@ -4,8 +4,8 @@ The vertices have the binary layout of 3DGS: position, unused normals, `f_dc`, `
 opacity, log scales, rotation to world axes (wxyz). Input cameras, the depth range, and the level and view of each
 Gaussian are not part of that layout. One header comment holds them, `comment pansplat {json}`, which other tools skip.
 
-The header holds the number of vertices. A file that is written part by part reserves space for its header and fills
-it at the end.
+The header holds the number of vertices. Of a file that is written part by part, the vertices are first in a temporary
+file of the same folder.
 
 Source: 3D Gaussian Splatting, the file that its training code writes.
 """
@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from operator import methodcaller
@@ -46,7 +47,6 @@ SCALE_EPSILON = 1e-12  # metres; smaller scales are clamped, so that the logarit
 
 COMMENT_PREFIX = "pansplat "  # start of the header's comment that holds the pansplat entry
 _MAX_HEADER = 1 << 24  # bytes of the longest header that is read
-_RUNS_SPACE = 4096  # bytes of a header for about 300 runs; some browser viewers need the header within 10,000 bytes
 _READ_VERTICES = 1 << 17  # vertices that are read at a time
 _MAX_PROPERTIES = 1 << 10  # properties that an element may have
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -88,16 +88,12 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
         ValueError: a part has another degree than the first.
     """
     path, unit = Path(path), scene.frame.unit
-    scene = scene.scaled(unit)
-    with replacing(path) as partial:
-        rest = map(methodcaller("scaled", unit), parts)  # keeps no reference to a part
-        first = [next(rest, scene.gaussians.select(scene.gaussians.levels < 0))]
-        coefficients = first[0].harmonics.shape[1]
-        size = len(_format_header(scene, [], coefficients)) + _RUNS_SPACE
+    with replacing(path) as partial, tempfile.TemporaryFile(dir=partial.parent) as vertices:
+        runs, dropped, coefficients = _write_parts(map(methodcaller("scaled", unit), parts), vertices)
+        vertices.seek(0)
         with open(partial, "wb") as file:
-            file.write(b" " * size)
-            runs, dropped = _write_parts(_chain(first, rest), file, coefficients)
-        _fill_header(partial, _format_header(scene, runs, coefficients, size=size), size)
+            file.write(_format_header(scene.scaled(unit), runs, coefficients))
+            shutil.copyfileobj(vertices, file, 1 << 24)
     count = sum(run[2] for run in runs)
     if dropped:
         warnings.warn(
@@ -106,17 +102,12 @@ def save_ply_parts(scene: Scene, parts: Iterable[Gaussians], path: str | Path) -
     return count
 
 
-def _chain(first: list[Gaussians], rest: Iterator[Gaussians]) -> Iterator[Gaussians]:
-    """The first part and the rest; keeps no reference to a consumed part."""
-    yield first.pop()
-    yield from rest
-
-
-def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) -> tuple[list[list[int]], int]:
-    """Write the vertices; return the runs of labels and the number of non-finite Gaussians."""
+def _write_parts(parts: Iterable[Gaussians], file: BinaryIO) -> tuple[list[list[int]], int, int]:
+    """Write the vertices; return the runs of labels, and the numbers of non-finite Gaussians and of harmonics."""
     runs: list[list[int]] = []
-    dropped = 0
+    dropped = coefficients = 0
     for part in parts:
+        coefficients = coefficients or part.harmonics.shape[1]
         if part.harmonics.shape[1] != coefficients:
             raise ValueError(f"`parts` must have {coefficients} harmonics each, got {part.harmonics.shape[1]}")
         finite = finite_mask(part)
@@ -129,35 +120,20 @@ def _write_parts(parts: Iterable[Gaussians], file: BinaryIO, coefficients: int) 
                 runs.append([level, view, count])
         file.write(_build_vertex_table(kept).data)
         del part, kept
-    return runs, dropped
+    return runs, dropped, coefficients or 1
 
 
-def _fill_header(path: Path, content: bytes, size: int) -> None:
-    """Write the header into the reserved `size` bytes; a longer header moves the vertices, in pieces."""
-    if len(content) == size:
-        with open(path, "r+b") as file:
-            file.write(content)
-        return
-    with replacing(path) as longer, open(path, "rb") as vertices, open(longer, "wb") as file:
-        file.write(content)
-        vertices.seek(size)
-        shutil.copyfileobj(vertices, file, 1 << 24)
-
-
-def _format_header(scene: Scene, runs: list[list[int]], coefficients: int, *, size: int = 0) -> bytes:
+def _format_header(scene: Scene, runs: list[list[int]], coefficients: int) -> bytes:
     """All bytes before the first vertex; the Gaussians of `scene` are not used.
 
     Args:
         runs: see `find_label_runs`.
         coefficients: number of harmonics coefficients, 1 to 25.
-        size: minimum number of bytes; spaces after the comment fill the difference.
     """
     comment = COMMENT_PREFIX + format_entry(scene, runs)
-    begin = f"ply\nformat binary_little_endian 1.0\ncomment {comment}"
-    lines = [f"element vertex {sum(count for _, _, count in runs)}"]
-    lines += _list_property_lines(coefficients)
-    end = "\n" + "\n".join(lines)
-    return (begin + " " * (size - len(begin) - len(end)) + end).encode("ascii")
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    lines += [f"element vertex {sum(count for _, _, count in runs)}", *_list_property_lines(coefficients)]
+    return "\n".join(lines).encode("ascii")
 
 
 def save_points(scene: Scene, path: str | Path) -> None:

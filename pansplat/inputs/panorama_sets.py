@@ -167,6 +167,11 @@ class PanoramaSet:
         return f"<PanoramaSet {self.name}: {', '.join(parts)}, in {self.folder}>"
 
     @property
+    def panoramas(self) -> tuple[Panorama, ...]:
+        """Those of its scene, in order, as `TourGraph` names them: the context."""
+        return self.context
+
+    @property
     def image_height(self) -> int:
         """Height of the smallest context panorama, pixels."""
         return min(read_height(panorama.image) for panorama in self.context)

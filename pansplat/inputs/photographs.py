@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.images.cube_faces import group_faces
 from pansplat.images.cube_images import CUBE_SUFFIX, CubeImage
 from pansplat.images.image_files import is_two_to_one, list_pictures, require_panorama

@@ -41,10 +41,6 @@ _T = TypeVar("_T")
 _MAX_NAMES = 4  # names that an error message lists
 
 
-class UnsafeCheckpointError(InputError):
-    """A checkpoint contains code, which was not executed."""
-
-
 @dataclass(frozen=True)
 class WeightsFile:
     """Content of a weights file.
@@ -138,7 +134,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """Read the tensors and plain values of a PyTorch (Lightning) checkpoint, without executing code in it.
 
     Raises:
-        UnsafeCheckpointError: the file contains code.
+        InputError: the file contains code, or is damaged.
     """
     path = Path(path)
     _require_file(path)
@@ -150,7 +146,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             raise InputError(
                 f"{path}: needed a PyTorch checkpoint, got other contents; {_suggest_remedy(path)}"
             ) from error
-        raise UnsafeCheckpointError(
+        raise InputError(
             f"{path}: needed a checkpoint of tensors and plain values, got one that calls {code[1]}; the call was not "
             "executed. If you trust the source of the file, keep only its `state_dict`: "
             "torch.save({'state_dict': torch.load(PATH, weights_only=False)['state_dict']}, NEW_PATH)"

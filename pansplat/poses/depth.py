@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-from pansplat.sweep.surface import rotate_image, upright_rotation
+from pansplat.sweep.panoramas import rotate_image, upright_rotation
 
 _LEAST_DEVIATION = 0.04  # deviation of log-depth at a right match: heights of two cameras differ, too
 _TAIL = 2.0  # degrees of freedom of a right match's deviation
@@ -70,7 +70,7 @@ def estimate_depth(image: Float[Array, "h w 3"], down: Float[Array, "3"] | None)
 
 
 def sample_nearest(values: Float[Array, "h w"], rays: Float[Array, "n 3"]) -> Float[Array, "n"]:
-    """Nearest values of an equirectangular map at directions."""
+    """Nearest values of an equirectangular map at directions, as float64."""
     height, width = values.shape
     column = (np.arctan2(rays[:, 0], rays[:, 2]) / (2 * math.pi) + 0.5) * width
     row = (np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2])) / math.pi + 0.5) * height

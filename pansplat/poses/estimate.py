@@ -34,6 +34,7 @@ from pansplat.poses.features import (
     match_features,
 )
 from pansplat.poses.learned import (
+    LEAST_COMMON,
     NO_LEARNED,
     LearnedFeatures,
     Matcher,
@@ -521,7 +522,7 @@ def _relate_views(
 
     def relate(pair: IndexPair) -> RelativePose:
         first, second = views[pair[0]], views[pair[1]]
-        matches = _match(first, second, matcher)
+        matches = _match(first, second, matcher, is_linked=links[pair] != NO_LINKS)
         prior = RotationPrior(first.axes, second.axes)
         relation = _estimate_pair(first, second, matches, prior, links[pair])
         if not (relation.is_reliable or relation.is_doubtful):
@@ -568,12 +569,12 @@ def fingerprint_estimates() -> str:
     return hash_parts(hash_sources(__name__), *map(hash_file, files))
 
 
-def _match(first: _View, second: _View, matcher: Matcher) -> Matches:
+def _match(first: _View, second: _View, matcher: Matcher, *, is_linked: bool = False) -> Matches:
     """Matches of `matched` features: by SIFT, and by the learned matcher where those hardly suffice."""
     matches = match_features(first.features, second.features)
     if matches.prior[matches.prior > _COUNTED_PRIOR].sum() > _ENOUGH_SIFT_MATCHES:
         return matches
-    found = match_learned(matcher, first.learned, second.learned)
+    found = match_learned(matcher, first.learned, second.learned, least_common=0 if is_linked else LEAST_COMMON)
     learned = Matches(found.indices, np.minimum(found.prior, _LEARNED_PRIOR))
     every = matches.joined(learned.shifted(len(first.features), len(second.features)))
     return drop_repeated(first.matched, second.matched, every)

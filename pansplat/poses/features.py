@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray as Array
 
-from pansplat.geometry.equirect import uv_from_directions
 from pansplat.geometry.pose import rotations_from_quats
+from pansplat.poses.depth import sample_nearest
 from pansplat.poses.solvers import compiled
 
 _FIELD_OF_VIEW = 100.0  # angle of a face, degrees; 10 more than a cube's
@@ -146,7 +146,7 @@ def detect_features(
         rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ rotation.T
         own = (rays @ rotations[:, :, 2].T).argmax(axis=1) == face
         if mask is not None:
-            own &= sample_mask(mask, rays)
+            own &= sample_nearest(mask, rays) > 0
         bearings.append(rays[own])
         descriptors.append(found[own])
         keypoints.append(np.array([(point.response, point.size) for point in points])[own])
@@ -173,14 +173,6 @@ def render_face(
     v = np.arctan2(y, np.sqrt(x * x + z * z)) * np.float32(height / math.pi) + np.float32(height / 2 - 0.5)
     padded = cv2.copyMakeBorder(image, 0, 0, margin, margin, cv2.BORDER_WRAP)
     return cv2.remap(padded, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-
-def sample_mask(mask: Bool[Array, "height width"], rays: Float[Array, "n 3"]) -> Bool[Array, "n"]:
-    """The mask of a panorama at directions."""
-    height, width = mask.shape
-    uv = uv_from_directions(torch.from_numpy(rays)).numpy()
-    columns = (uv[:, 0] * width).astype(int).clip(0, width - 1)
-    return mask[(uv[:, 1] * height).astype(int).clip(0, height - 1), columns]
 
 
 def match_features(first: Features, second: Features) -> Matches:

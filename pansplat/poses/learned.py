@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from pansplat.networks.aliked import Aliked
 from pansplat.networks.lightglue import LightGlue
 from pansplat.networks.weights import load_weights, require_shapes
-from pansplat.poses.features import FACE_ROTATIONS, Matches, are_distinct, render_face
+from pansplat.poses.features import FACE_ROTATIONS, NO_MATCHES, Matches, are_distinct, render_face
 
 _FACES = 4  # horizontal ones; floor and ceiling have few keypoints, and no upright direction
 _KEYPOINTS = 640  # largest number for a face
@@ -92,6 +92,9 @@ class LearnedFeatures:
         return self.points[own], self.descriptors[own]
 
 
+LEAST_COMMON = 18
+"""Distinctive descriptors in common of two panoramas of one room: those of other rooms have 10 to 90, all pairs with a
+pose of five real homes 21 or more (docs/poses.md)."""
 NO_LEARNED = LearnedFeatures(np.empty((0, 3)), torch.empty(0, 128), torch.empty(0, 2), (0,) * (_FACES + 1))
 
 
@@ -130,13 +133,20 @@ def detect_learned(
     return LearnedFeatures(np.concatenate(bearings), torch.cat(descriptors), torch.cat(places), tuple(starts))
 
 
-def match_learned(matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures) -> Matches:
+def match_learned(
+    matcher: Matcher, first: LearnedFeatures, second: LearnedFeatures, *, least_common: int = 0
+) -> Matches:
     """Matches of two panoramas, whose prior is the probability that each is right.
 
     A match that contradicts or repeats a more probable one is left out.
+
+    Args:
+        least_common: panoramas with fewer distinctive descriptors in common have no matches.
     """
     common, device = count_common(first, second), next(matcher.parameters()).device
     order = np.argsort(-common, axis=None, kind="stable")[:_FACE_PAIRS]
+    if common.flat[order].sum() < least_common:
+        return NO_MATCHES
     indices, priors = [np.empty((0, 2), np.int64)], [np.empty(0)]
     constant, by_score, by_support = _CALIBRATION
     for i, j in np.stack(np.unravel_index(order, common.shape), axis=1).tolist():

@@ -21,13 +21,13 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.path import level_pose, up_direction, wrap_angle
+from pansplat.geometry.level import level_pose, turn_axes, up_direction, wrap_angle
 from pansplat.images.image_files import read_height, read_panorama
 from pansplat.poses.axes import SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import estimate_depth
 from pansplat.tours.floor import find_ceiling, trace_floor
-from pansplat.tours.linked_rooms import turn_plan
+from pansplat.tours.linked_rooms import WALL_THICKNESS, turn_plan
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
 _IMAGE_HEIGHT = 1024  # rows of the panorama in which edges are looked for, at most
@@ -36,7 +36,7 @@ _UPRIGHT = math.radians(8)  # y is down in a world whose cameras' mean down is w
 _DOOR = math.radians(16)  # surfaces around the direction of a door have a normal weight of this deviation
 _LINTEL = 0.6, 0.95  # heights above doors and below the ceiling, over that of the ceiling above the camera
 _WALL_TURN, _GRAZING = math.radians(25), 0.12  # surfaces of a wall turn less; least cosine of a link and a normal
-_LEAST_WALL, _THICKNESS = 0.25, 0.08  # least distance of a wall with a door, and its thickness, camera heights
+_LEAST_WALL = 0.25  # least distance of a wall with a door, camera heights
 _ALIKE, _NO_DOOR = 7.65, 0.1  # weight of the likeness, as in the check of poses; weight that no door is common
 
 
@@ -98,7 +98,7 @@ def list_through_door(
     doors = [piece.find_doors(_level_yaw(*link, piece.upright)) for piece, link in zip(pieces, links, strict=True)]
     frame, found = PlanFrame(pieces[0].upright, 1.0), []
     for (there, share), (back, other) in itertools.product(*doors):
-        right, forward = _THICKNESS * math.sin(there.yaw), _THICKNESS * math.cos(there.yaw)
+        right, forward = WALL_THICKNESS * math.sin(there.yaw), WALL_THICKNESS * math.cos(there.yaw)
         behind = PlanPose(there.right + right, there.forward + forward, wrap_angle(there.yaw + math.pi - back.yaw))
         place = behind.add(PlanPose(-back.right, -back.forward, 0.0))
         pose = frame.make_pose(place, pieces[1].upright, 0.0)
@@ -239,10 +239,8 @@ class PlanFrame:
 
     def make_pose(self, place: PlanPose, upright: Float[Array, "3 3"], down: float) -> Float[Array, "4 4"]:
         """The pose, cam2world, of an upright camera at a place; `down` is its place along that axis, metres."""
-        cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
         pose = np.eye(4)
-        turn = np.array(((cosine, 0, sine), (0, 1, 0), (-sine, 0, cosine)))
-        pose[:3, :3] = self.level @ turn @ upright.T
+        pose[:3, :3] = turn_axes(self.level, place.yaw, 0.0) @ upright.T
         pose[:3, 3] = self.level @ (place.right, down, place.forward)
         return pose
 

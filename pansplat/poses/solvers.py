@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
@@ -71,14 +72,8 @@ def make_motion(
 
 
 def rotation_exp(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """Rotation matrices of rotation vectors, radians. Source: Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    k = skew(vectors)
-    small = angle < 1e-6
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1 - angle**2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    return np.eye(3) + a * k + b * (k @ k)
+    """Rotation matrices of one or several rotation vectors, radians."""
+    return scipy.spatial.transform.Rotation.from_rotvec(vectors).as_matrix()
 
 
 def rotation_angle(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:

@@ -68,13 +68,11 @@ class Tour:
     Attributes:
         groups: the largest one first.
         confirmed: doubtful pairs that agree with the others of their group.
-        rejected: pairs that contradict the others.
         unplaced: for each panorama without a pose why, the other panorama of its best pair, and figures of that pair.
     """
 
     groups: tuple[Group, ...]
     confirmed: dict[IndexPair, RelativePose]
-    rejected: tuple[IndexPair, ...]
     unplaced: dict[int, tuple[str, int | None, str]]
 
 
@@ -92,9 +90,7 @@ def build_tour(
         downs: gravity in each camera's frame; NaN where unknown.
         noise: standard deviation of a bearing, radians.
     """
-    reliable = {pair: relation for pair, relation in relations.items() if relation.is_reliable and relation.is_matched}
-    rejected = _find_contradictions(reliable)
-    reliable = {pair: relation for pair, relation in reliable.items() if pair not in rejected}
+    reliable = drop_contradictions({p: r for p, r in relations.items() if r.is_reliable and r.is_matched})
     groups = _place_groups(features, reliable, downs, noise)
     parts = _join_parts(groups, relations, len(features))
     confirmed = _confirm(parts, relations)
@@ -104,7 +100,7 @@ def build_tour(
     groups.sort(key=lambda group: (-len(group.placed), group.placed))
     placed = {view for group in groups for view in group.placed}
     unplaced = {view: _describe_failure(view, relations) for view in range(len(features)) if view not in placed}
-    return Tour(tuple(groups), confirmed, rejected, unplaced)
+    return Tour(tuple(groups), confirmed, unplaced)
 
 
 def _place_groups(
@@ -260,23 +256,20 @@ def _describe_failure(view: int, relations: Mapping[IndexPair, RelativePose]) ->
     return reason, pair[0] if pair[1] == view else pair[1], figures
 
 
-def _find_contradictions(relations: Mapping[IndexPair, RelativePose]) -> tuple[IndexPair, ...]:
-    """Pairs that contradict two better pairs of a triangle more often than they agree, by rotation or by translation.
+def drop_contradictions(relations: Mapping[IndexPair, RelativePose]) -> dict[IndexPair, RelativePose]:
+    """The pairs without those that contradict two better ones of a triangle more often than they agree.
 
-    A pair is compared with its triangles in the order of the odds and scores, so that a wrong one does not discredit
-    others.
+    They contradict each other by rotation or by translation. A pair is compared with its triangles in the order of the
+    odds and scores, so that a wrong one does not discredit others.
     """
     kept: dict[IndexPair, RelativePose] = {}
-    rejected = []
     for pair in sorted(relations, key=lambda p: (-relations[p].log_odds, -relations[p].score)):
         others = {view for other in kept for view in other} - set(pair)
         closed = [_closes(kept, relations[pair], pair, k) for k in others]
         loops = [is_closed for is_closed in closed if is_closed is not None]
-        if loops and sum(loops) * 2 < len(loops):
-            rejected.append(pair)
-        else:
+        if not loops or sum(loops) * 2 >= len(loops):
             kept[pair] = relations[pair]
-    return tuple(rejected)
+    return {pair: relation for pair, relation in relations.items() if pair in kept}
 
 
 def _motion_between(known: Mapping[IndexPair, RelativePose], i: int, j: int) -> Float[Array, "4 4"] | None:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from pansplat.geometry.equirect import pixel_directions
+from pansplat.geometry.level import level_pose
 from pansplat.system.threads import worker_threads
 from pansplat.tours.floor import find_storeys
 
@@ -51,12 +52,7 @@ def level_poses(poses: Float[Array, "view 4 4"], downs: Float[Array, "view 3"]) 
     if not len(world):
         world = poses[:, :3, 1]
     down = np.median(world, axis=0)
-    down /= np.linalg.norm(down)
-    forward = poses[0, :3, 2] - (poses[0, :3, 2] @ down) * down
-    if np.linalg.norm(forward) < 1e-3:
-        forward = np.cross(poses[0, :3, 0], down)
-    forward /= np.linalg.norm(forward)
-    axes = np.stack((np.cross(down, forward), down, forward))
+    axes = level_pose(torch.from_numpy(poses[0]), torch.from_numpy(-down))[:3, :3].numpy().T
     levelled = poses.copy()
     levelled[:, :3, :3] = axes @ poses[:, :3, :3]
     levelled[:, :3, 3] = (poses[:, :3, 3] - poses[0, :3, 3]) @ axes.T

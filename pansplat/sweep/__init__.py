@@ -2,8 +2,9 @@
 
 In the order of the pipeline: `predictor` (the call), `search` (observation, then three levels), `axes` (of the scene),
 `prior` (depth that a model expects), `matching` (matching cost and its aggregation), `bend` (single views, bent by
-matches), `surface` (consistency between views, upsampling), `lift` (Gaussians). `guided_sweep` loads the networks of
-the prior; `joined_crops` joins the depth of a user's network.
+matches, over `smoothing`), `whole` (surfaces without holes), `lift` (Gaussians). They use `surface` (consistency
+between views, upsampling) and `panoramas` (as numpy arrays). `guided_sweep` loads the networks of the prior;
+`joined_crops` joins the depth of a user's network.
 """
 
 from pansplat.sweep.predictor import Sweep

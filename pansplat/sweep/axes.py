@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from pansplat.sweep.surface import pad_sphere, ray_grid
+from pansplat.sweep.panoramas import pad_sphere, ray_grid
 
 _MIN_GRADIENT = 0.02  # per pixel; smaller gradients are noise
 _MAX_GRADIENT = 0.2  # larger gradients have the weight of this one

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.geometry.equirect import row_weights
+from pansplat.sweep.panoramas import nearest_pixel, pad_sphere
 from pansplat.sweep.smoothing import as_meridians, smooth_sphere
-from pansplat.sweep.surface import PosedImages, Surface, nearest_pixel, pad_sphere, world_points
+from pansplat.sweep.surface import PosedImages, Surface, world_points
 
 _MIN_EVIDENCE = 1e-3  # fraction of the sphere with evidence, below which the field is the median of all pixels
 

@@ -32,9 +32,9 @@ from pansplat.networks.weights import (
 )
 from pansplat.sweep import Sweep
 from pansplat.sweep.joined_crops import crop_panorama, join_crops
+from pansplat.sweep.panoramas import resize_sphere
 from pansplat.sweep.prior import DepthPrior
 from pansplat.sweep.search import SearchConfig
-from pansplat.sweep.surface import resize_sphere
 from pansplat.system.devices import choose_device
 from pansplat.system.source_hash import hash_sources
 
@@ -116,7 +116,7 @@ def _shipped(name: str) -> Path:
 
 
 class NetworkPrior:
-    """A `PriorModel` of a depth network.
+    """Estimates of depth by a depth network. `fingerprint` changes whenever they could.
 
     Args:
         load: reads the two networks, in eval mode, when they are needed first.
@@ -170,7 +170,13 @@ class NetworkPrior:
 
 
 class NetworkObservation:
-    """`ObservedViews` of a depth network."""
+    """The depth network's view of upright panoramas.
+
+    Attributes:
+        priors: the estimate of each panorama by itself, in units of its camera's height.
+        sharpen: returns log-depth (h, w) of each panorama by itself, larger than the priors, with the edges of the
+            photograph.
+    """
 
     def __init__(
         self,

@@ -24,23 +24,24 @@ import torch
 
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
-from pansplat.geometry.equirect import row_weights
+from pansplat.geometry.equirect import row_weights, sample_equirect, uv_from_directions
 from pansplat.geometry.fibonacci import fibonacci_directions, lattice_size
-from pansplat.sweep.surface import (
-    CONSISTENT,
-    FREE_SPACE,
-    PosedImages,
-    Surface,
-    classify_point,
-    consistency_mask,
+from pansplat.sweep.panoramas import (
     for_point_ranges,
-    guided_upsample,
-    locate,
     locate_pixel,
     nearest_pixel,
     pad_sphere,
     resize_mask,
     resize_sphere,
+)
+from pansplat.sweep.surface import (
+    CONSISTENT,
+    FREE_SPACE,
+    PosedImages,
+    Surface,
+    classify_visibility,
+    consistency_mask,
+    guided_upsample,
 )
 from pansplat.system.kernels import cached_njit
 
@@ -214,14 +215,13 @@ def _lift_lattice(
     quats, scales = np.empty((len(rays), 4), np.float32), np.empty((len(rays), 3), np.float32)
     shape = rays, inverse_depth, gradient, size, steepest, _THICKNESS, pose, quats, scales
     for_point_ranges(partial(_shape_discs, *shape), len(rays))
-    color = np.empty((len(rays), 3), np.float32)
-    for_point_ranges(partial(_sample_bilinear, pad_sphere(image, 1), rays, color), len(rays))
+    color = sample_equirect(torch.from_numpy(image).permute(2, 0, 1), uv_from_directions(torch.from_numpy(rays)))
     return Gaussians(
         means=torch.from_numpy(points).float(),
         scales=torch.from_numpy(scales),
         quats=torch.from_numpy(quats),
         opacities=torch.from_numpy(opacity),
-        harmonics=torch.from_numpy((color - 0.5) / SH_0).float()[:, None, :],
+        harmonics=((color.T - 0.5) / SH_0).contiguous()[:, None],
         levels=torch.full((len(points),), level, dtype=torch.uint8),
         views=torch.full((len(points),), view, dtype=torch.uint8),
     )
@@ -231,20 +231,6 @@ def _locate_lattice(rows: int, height: int) -> _Lattice:
     """The lattice with the spacing of the pixels of `rows` rows, in a panorama of `height` rows."""
     rays = fibonacci_directions(lattice_size(2 * rows)).numpy()
     return rays, nearest_pixel(rays, height)
-
-
-@cached_njit(nogil=True)
-def _sample_bilinear(padded, rays, samples, first, end):
-    """Write bilinear samples (n, c) of a panorama, which is padded by one pixel, along rays (n, 3)."""
-    height = len(padded) - 2
-    for n in range(first, end):
-        x, y = locate(rays[n, 0], rays[n, 1], rays[n, 2], height)
-        column, row = min(int(x + 0.5), 2 * height), min(int(y + 0.5), height)  # pixel of the padded image
-        right, lower = x + 0.5 - column, y + 0.5 - row
-        for c in range(samples.shape[1]):
-            above = padded[row, column, c] * (1 - right) + padded[row, column + 1, c] * right
-            below = padded[row + 1, column, c] * (1 - right) + padded[row + 1, column + 1, c] * right
-            samples[n, c] = above * (1 - lower) + below * lower
 
 
 def _window_extremum(values: np.ndarray, radius: int, *, largest: bool) -> np.ndarray:
@@ -300,31 +286,20 @@ def _estimate_opacity(points: np.ndarray, scene: _PosedSurfaces, view: int) -> t
     A point in the consistent free space of more views than confirm it is not kept.
     """
     posed = scene.posed
-    # Rows of `counts`: views that confirm the point, that contradict it, that may, and that are too near to it.
-    counts = np.zeros((4, len(points)), np.int16)
+    confirmed, contradicted, doubtful, near = np.zeros((4, len(points)), np.int16)
     for other in scene.neighbours[view]:
         certain = scene.consistent[other] & posed.masks[other]
-        pose = np.ascontiguousarray(posed.cam2world[other], np.float64)
-        inverse = scene.surfaces[other].inverse_depth
-        limits = _DEPTH_TOLERANCE, _MIN_DISTANCE * posed.near
-        for_point_ranges(partial(_count_judgements, points, inverse, certain, pose, *limits, counts), len(points))
-    confirmed, contradicted, doubtful, near = counts
+        classes, distances, pixel = classify_visibility(
+            points, scene.surfaces[other], posed.cam2world[other], _DEPTH_TOLERANCE
+        )
+        is_free = classes == FREE_SPACE
+        confirmed += classes == CONSISTENT
+        contradicted += is_free & certain[pixel]
+        doubtful += is_free & ~certain[pixel]
+        near += distances <= _MIN_DISTANCE * posed.near
     opacity = np.where(doubtful > 0, np.float32(_UNCERTAIN_OPACITY), np.float32(_SINGLE_VIEW_OPACITY))
     opacity[confirmed > 0] = _CONSISTENT_OPACITY
     return opacity, (near == 0) & (contradicted <= confirmed)
-
-
-@cached_njit(nogil=True)
-def _count_judgements(points, inverse_depth, certain, cam2world, tolerance, nearest, counts, first, end):
-    """Add what a view says about each point to `counts`; see `_estimate_opacity`."""
-    for n in range(first, end):
-        kind, distance, row, column = classify_point(points[n], inverse_depth, cam2world, tolerance)
-        if kind == CONSISTENT:
-            counts[0, n] += 1
-        elif kind == FREE_SPACE:
-            counts[1 if certain[row, column] else 2, n] += 1
-        if distance <= nearest:
-            counts[3, n] += 1
 
 
 def _differentiate_log(inverse: np.ndarray, discontinuity: float) -> np.ndarray:

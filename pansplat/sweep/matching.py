@@ -16,10 +16,9 @@ Source: Hirschmueller, doi:10.1109/TPAMI.2007.1166, generalised from fronto-para
 from __future__ import annotations
 
 import math
-from collections import namedtuple
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -28,51 +27,37 @@ import numba as nb
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
-from pansplat.sweep.surface import pad_sphere, ray_grid
+from pansplat.sweep.panoramas import pad_sphere, ray_grid
 from pansplat.system.kernels import cached_njit, fast_atan2, parallel_for, thread_count
 
 _LUMA = np.array((0.299, 0.587, 0.114), np.float32)
+_WINDOW = 2  # half size of the correlation window, pixels
 _BATCH = 8  # hypotheses that a thread processes together
 
 
-@dataclass(frozen=True)
-class MatchingConfig:
+class MatchingWeights(NamedTuple):
     """Weights of the matching cost, for image values in [0, 1]."""
 
-    window: int = 2
-    """Half size of the correlation window, pixels."""
     correlation_weight: float = 1.0
     color_weight: float = 0.5
-    color_truncation: float = 0.15
-    """Mean absolute colour difference at which the colour cost is truncated."""
-    variance_epsilon: float = 4e-4
-    """Added to the variances, so that noise in flat windows has no effect."""
-    free_space_penalty: float = 0.5
-    """For a hypothesis in front of the other view's surface."""
-    consistency_bonus: float = 0.15
-    """For a hypothesis on the other view's surface."""
-    occluded_cost: float = 0.9
-    """Cost of a hypothesis behind the other view's surface, where it cannot be matched."""
-    back_facing_cost: float = 0.8
-    """Cost of a plane between the two cameras: each would see a different side of it."""
-    tolerance: float = 0.08
-    """Relative difference of inverse depth within which two views are consistent."""
-    textureless_weight: float = 0.3
-    """Weight of the matching cost in a window without texture; it is one in a textured window."""
-    textureless_cost: float = 0.4
-    """Cost that replaces the rest of the matching cost in such a window."""
-    texture_variance: float = 4e-4
-    """Variance of a window that is half textured."""
-    distance_ratio: float = 4.0
-    """Ratio of a point's distances to the two cameras up to which there is no penalty."""
-    distance_penalty: float = 0.5
-    """Penalty for an infinite ratio: half the view shrinks to a few pixels, which match everything."""
-    opposed_penalty: float = 0.5
-    """For a sphere where the rays to a point are opposed: the cameras would see opposite sides of the surface."""
-    opposed_from: float = 0.2
-    """Cosine between the rays (78 degrees) at which this penalty starts."""
-    opposed_to: float = -0.5
-    """Cosine (120 degrees) at which it is full."""
+    color_truncation: float = 0.15  # mean absolute colour difference at which the colour cost is truncated
+    variance_epsilon: float = 4e-4  # added to the variances, so that noise in flat windows has no effect
+    free_space_penalty: float = 0.5  # for a hypothesis in front of the other view's surface
+    consistency_bonus: float = 0.15  # for a hypothesis on the other view's surface
+    occluded_cost: float = 0.9  # of a hypothesis behind the other view's surface, where it cannot be matched
+    back_facing_cost: float = 0.8  # of a plane between the two cameras: each would see a different side of it
+    tolerance: float = 0.08  # relative difference of inverse depth within which two views are consistent
+    textureless_weight: float = 0.3  # of the matching cost in a window without texture; one in a textured window
+    textureless_cost: float = 0.4  # replaces the rest of the matching cost in such a window
+    texture_variance: float = 4e-4  # of a window that is half textured
+    distance_ratio: float = 4.0  # of a point's distances to the two cameras up to which there is no penalty
+    distance_penalty: float = 0.5  # for an infinite ratio: half the view shrinks to pixels that match everything
+    opposed_penalty: float = 0.5  # for a sphere where the cameras would see opposite sides of the surface
+    opposed_from: float = 0.2  # cosine between the rays to a point (78 degrees) at which this penalty starts
+    opposed_to: float = -0.5  # cosine (120 degrees) at which it is full
+
+
+_WEIGHTS = MatchingWeights()
 
 
 @cached_njit(fastmath=True, nogil=True, error_model="numpy")
@@ -147,9 +132,6 @@ def _pad_in_place(padded, m):
 
 
 # Arguments of the kernels; numba compiles a named tuple's fields as separate variables.
-_Weights = namedtuple("_Weights", [field.name for field in fields(MatchingConfig) if field.name != "window"])
-
-
 class _Matched(NamedTuple):
     """The view that is matched: its image, rays and masks, and the grey values of its windows.
 
@@ -398,9 +380,9 @@ def compute_matching_cost(
     view: View,
     others: Sequence[OtherView],
     limits: tuple[float, float],
-    config: MatchingConfig,
+    weights: MatchingWeights = _WEIGHTS,
 ) -> np.ndarray:
-    """Matching cost (h, w, sets * count) of every hypothesis, in the unit of the config's weights.
+    """Matching cost (h, w, sets * count) of every hypothesis, in the unit of the weights.
 
     It is the mean over the other views that can see the hypothesis; over all of them where none can.
 
@@ -408,7 +390,7 @@ def compute_matching_cost(
         limits: smallest and largest inverse depth, 1/m.
     """
     height, width = view.image.shape[:2]
-    m = config.window
+    m = _WINDOW
     gray = pad_sphere(view.image @ _LUMA, m)
     window = (2 * m + 1, 2 * m + 1)
     inside = (slice(m, -m), slice(m, -m))
@@ -417,7 +399,7 @@ def compute_matching_cost(
     variance = np.maximum(variance - mean * mean, 0)
     matched = _Matched(view.image, view.valid, ray_grid(height), gray, mean, variance)
     low, high = np.float32(limits)
-    weights = _Weights(*(np.float32(getattr(config, name)) for name in _Weights._fields))
+    weights = MatchingWeights(*map(np.float32, weights))
     count = len(others[0].sets[0].penalty)
     shape = height, width, len(others[0].sets) * count
     several = len(others) > 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,11 +19,13 @@ from pansplat.inputs.panorama_sets import MAX_CONTEXT
 from pansplat.predictor import require_matching_inputs, select_item
 from pansplat.rendering.color_fit import fit_colors
 from pansplat.sweep.lift import lift
-from pansplat.sweep.prior import PriorModel
 from pansplat.sweep.search import SearchConfig, observe, search
 from pansplat.sweep.surface import PosedImages
 from pansplat.system.progress import report_progress, stage
 from pansplat.system.source_hash import hash_sources
+
+if TYPE_CHECKING:
+    from pansplat.sweep.guided_sweep import NetworkPrior
 
 _HEIGHT_MULTIPLE = 8  # the levels of the Gaussians divide the height; other heights are resized to the next multiple
 
@@ -40,7 +43,7 @@ class Sweep:
     """Largest height that is chosen for a pair without a given height."""
 
     def __init__(
-        self, config: SearchConfig | None = None, prior: PriorModel | None = None, name: str = "sweep"
+        self, config: SearchConfig | None = None, prior: NetworkPrior | None = None, name: str = "sweep"
     ) -> None:
         self.config, self.prior, self.name = config or SearchConfig(), prior, name
         digest = hashlib.blake2b(f"{self.config} {hash_sources(__name__)}".encode(), digest_size=8)

@@ -13,24 +13,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from pansplat.geometry.equirect import row_weights
 from pansplat.inputs.views import CAMERA_HEIGHT
-from pansplat.sweep.matching import HypothesisSet, MatchingConfig, OtherView, View, compute_matching_cost
-from pansplat.sweep.surface import (
-    list_best_pairs,
-    measure_distances,
-    nearest_pixel,
-    ray_grid,
-    resize_sphere,
-    rotate_image,
-    upright_rotation,
-)
+from pansplat.sweep.matching import HypothesisSet, OtherView, View, compute_matching_cost
+from pansplat.sweep.panoramas import nearest_pixel, ray_grid, resize_sphere, rotate_image, upright_rotation
+from pansplat.sweep.surface import list_best_pairs, measure_distances
 from pansplat.system.kernels import cached_njit, parallel_for, thread_count
+
+if TYPE_CHECKING:
+    from pansplat.sweep.guided_sweep import NetworkPrior
 
 _HEIGHT_CANDIDATES = 40  # inverse heights of the cameras that are compared
 _MAX_VARIANCE = 4e-3  # largest variance of grey values that raises a weight; more texture has no more
@@ -72,40 +68,6 @@ class DepthPrior:
         return DepthPrior(rotated[..., 0], rotated[..., 1])
 
 
-class ObservedViews(Protocol):
-    """The model's view of upright panoramas.
-
-    Attributes:
-        priors: the estimate of each panorama by itself, in units of its camera's height.
-    """
-
-    priors: list[DepthPrior]
-
-    def sharpen(self) -> list[np.ndarray]:
-        """Log-depth (h, w) of each panorama by itself, larger than the priors, with the edges of the photograph."""
-        ...
-
-    def refine(
-        self,
-        estimates: Sequence[DepthPrior],
-        cam2world: np.ndarray,
-        neighbours: Sequence[Sequence[int]],
-        iterations: int,
-    ) -> list[DepthPrior]:
-        """Estimates in the unit of the poses (v, 4, 4), refined by comparison of each view with its neighbours."""
-        ...
-
-
-class PriorModel(Protocol):
-    """Estimates depth. `fingerprint` changes whenever the estimates could."""
-
-    fingerprint: str
-
-    def observe(self, images: Sequence[np.ndarray]) -> ObservedViews:
-        """Observe upright panoramas (h, w, 3), RGB in [0, 1]."""
-        ...
-
-
 class PriorEstimator:
     """Estimates the priors of each view, in the unit of the poses.
 
@@ -119,7 +81,7 @@ class PriorEstimator:
 
     def __init__(
         self,
-        model: PriorModel,
+        model: NetworkPrior,
         images: Sequence[np.ndarray],
         cam2world: np.ndarray,
         down: np.ndarray,
@@ -293,7 +255,7 @@ def _match_heights(
     for n, other in enumerate(views):
         if n != index:
             matched = OtherView(other, np.linalg.inv(cam2world[n]) @ cam2world[index], [shape])
-            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6), MatchingConfig())
+            cost = compute_matching_cost(views[index], [matched], (1e-6, 1e6))
             total += np.einsum("hw,hwk->k", weight, np.minimum(cost, _MAX_COST))
     return total
 

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -29,26 +30,20 @@ from pansplat.sweep.bend import bend_surfaces
 from pansplat.sweep.matching import (
     DepthRange,
     HypothesisSet,
-    MatchingConfig,
     OtherView,
     View,
     aggregate_costs,
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.prior import DepthPrior, PriorEstimator, PriorModel, apply_prior_cost
-from pansplat.sweep.surface import (
-    PosedImages,
-    Surface,
-    guided_upsample,
-    list_best_pairs,
-    measure_distances,
-    resize_mask,
-    resize_sharp,
-    resize_sphere,
-)
+from pansplat.sweep.panoramas import resize_mask, resize_sharp, resize_sphere
+from pansplat.sweep.prior import DepthPrior, PriorEstimator, apply_prior_cost
+from pansplat.sweep.surface import PosedImages, Surface, guided_upsample, list_best_pairs, measure_distances
 from pansplat.sweep.whole import make_whole
 from pansplat.system.progress import report_progress
+
+if TYPE_CHECKING:
+    from pansplat.sweep.guided_sweep import NetworkPrior
 
 _LONE_STEP = 0.6  # metres by which a camera leaves a view that has no neighbours
 _SMALL_HEIGHT = 96  # rows of the panoramas with which heights of the cameras over the floor are compared
@@ -99,7 +94,7 @@ class ObservedScene:
 def observe(
     posed: PosedImages,
     config: SearchConfig,
-    prior_model: PriorModel | None = None,
+    prior_model: NetworkPrior | None = None,
 ) -> ObservedScene:
     """The depth range, neighbours, axes and priors of panoramas (v, h, 2h, 3)."""
     report_progress("finding the scene's axes", 0.0)
@@ -290,7 +285,7 @@ class _SearchLevel:
             OtherView(self.views[other], self.posed.relative_pose(view, other), make_sets(other))
             for other in self.neighbours[view]
         ]
-        return compute_matching_cost(self.views[view], others, self.limits, MatchingConfig())
+        return compute_matching_cost(self.views[view], others, self.limits)
 
     def _select_hypotheses(
         self, view: int, sets: list[HypothesisSet], cost: np.ndarray, slot_map: np.ndarray, slots: int

@@ -1,124 +1,22 @@
-"""The views' surfaces: consistency between views, upsampling, and panoramas as numpy arrays."""
+"""The views' surfaces: consistency between views, and upsampling."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import cv2
-import numba as nb
 import numpy as np
-import torch
 
-from pansplat.geometry.equirect import pixel_directions, rotate_equirect
+from pansplat.sweep.panoramas import for_point_ranges, locate_pixel, ray_grid, resize_mask, resize_sphere
 from pansplat.system.kernels import cached_njit, parallel_for, thread_count
 
 CONSISTENT, OCCLUDED, FREE_SPACE = 0, 1, 2  # on, behind, or in front of another view's surface
-_RANGE = 1 << 14  # points that a thread processes together
-_MIN_TILT = math.radians(0.5)  # a camera with less tilt is not turned upright
 _MAX_SMOOTH_CHANGE = 0.03  # largest relative change of inverse depth that is interpolated bilinearly
 _MAX_INCONSISTENCY = 0.06  # largest relative difference of depth of two views' surfaces that are consistent
-
-
-@functools.lru_cache(maxsize=4)
-def ray_grid(height: int) -> np.ndarray:
-    """Unit rays (height, 2 height, 3), float32, of a panorama's pixels; read-only."""
-    rays = pixel_directions(height, 2 * height).numpy()
-    rays.flags.writeable = False
-    return rays
-
-
-@nb.njit(inline="always")
-def locate(x, y, z, height):
-    """Continuous x and y of a direction of any length in a panorama; pixel centres at half-integers."""
-    column = (math.atan2(x, z) / (2 * math.pi) + 0.5) * 2 * height
-    return column, (math.atan2(y, math.sqrt(x * x + z * z)) / math.pi + 0.5) * height
-
-
-@nb.njit(inline="always")
-def locate_pixel(x, y, z, height):
-    """Row and column of the pixel that holds a direction."""
-    column, row = locate(x, y, z, height)
-    return min(int(row), height - 1), int(column) % (2 * height)
-
-
-def nearest_pixel(directions: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the pixel that holds each direction (..., 3)."""
-    flat = np.ascontiguousarray(directions, np.float64).reshape(-1, 3)
-    pixels = np.empty((2, len(flat)), np.int32)
-    for_point_ranges(partial(_locate_pixels, flat, height, pixels), len(flat))
-    row, column = pixels.reshape(2, *directions.shape[:-1])
-    return row, column
-
-
-@cached_njit(nogil=True)
-def _locate_pixels(directions, height, pixels, first, end):
-    for n in range(first, end):
-        pixels[0, n], pixels[1, n] = locate_pixel(directions[n, 0], directions[n, 1], directions[n, 2], height)
-
-
-def for_point_ranges(work: Callable[[int, int], object], count: int) -> None:
-    """Call `work` on all threads with the ends of ranges of points, 0 to `count`."""
-    parallel_for(lambda item: work(item * _RANGE, min((item + 1) * _RANGE, count)), -(-count // _RANGE), thread_count())
-
-
-def pad_sphere(image: np.ndarray, margin: int) -> np.ndarray:
-    """A panorama (h, w) or (h, w, c) padded by its neighbours on the sphere."""
-    over = np.roll(image, image.shape[1] // 2, axis=1)
-    rows = np.concatenate((over[:margin][::-1], image, over[-margin:][::-1]))
-    return np.ascontiguousarray(np.concatenate((rows[:, -margin:], rows, rows[:, :margin]), axis=1))
-
-
-def resize_sphere(image: np.ndarray, height: int) -> np.ndarray:
-    """A panorama (h, w) or (h, w, c) at another height: area average when smaller, bilinear when larger."""
-    if image.shape[0] == height:
-        return np.ascontiguousarray(image)
-    if image.shape[0] > height:
-        return cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA)
-    # The smallest margin that has whole pixels at both sizes: values continue over the seam and the poles.
-    common = math.gcd(image.shape[0], height)
-    margin, scaled = image.shape[0] // common, height // common
-    size = 2 * (height + scaled), height + 2 * scaled
-    large = cv2.resize(pad_sphere(image, margin), size, interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(large[scaled:-scaled, scaled:-scaled])
-
-
-def resize_sharp(values: np.ndarray, height: int) -> np.ndarray:
-    """A panorama (h, w) at another height: the nearest pixel when smaller, so that edges stay, bilinear when larger."""
-    if height >= len(values):
-        return resize_sphere(values, height)
-    return cv2.resize(values, (2 * height, height), interpolation=cv2.INTER_NEAREST_EXACT)
-
-
-def resize_mask(mask: np.ndarray, height: int) -> np.ndarray:
-    """A panorama (h, w) of bool at another height, by the nearest pixel."""
-    return cv2.resize(mask.astype(np.uint8), (2 * height, height), interpolation=cv2.INTER_NEAREST) > 0
-
-
-def upright_rotation(rotation: np.ndarray, down: np.ndarray) -> np.ndarray | None:
-    """The smallest rotation (3, 3) after which a camera's y axis is `down`, as new axes in the old ones.
-
-    None for a camera that is upright already.
-    """
-    target = rotation.T @ down
-    axis = np.cross((0.0, 1.0, 0.0), target)
-    sine, cosine = float(np.linalg.norm(axis)), float(target[1])
-    angle = math.atan2(sine, cosine)
-    if angle < _MIN_TILT:
-        return None
-    if sine < 1e-9:  # the camera is upside down
-        return np.diag((1.0, -1.0, -1.0))
-    return cv2.Rodrigues(axis / sine * angle)[0]
-
-
-def rotate_image(image: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """A panorama (h, w, c) of the camera rotated by `rotation` (3, 3), its new axes in the old ones."""
-    maps = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
-    return np.ascontiguousarray(rotate_equirect(maps, torch.from_numpy(rotation)).permute(1, 2, 0).numpy())
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,32 +56,35 @@ class PosedImages:
         return float(measure_distances(self.cam2world[list(views)]).max())
 
 
-def classify_visibility(points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float) -> np.ndarray:
-    """Class (uint8) of world points (..., 3): CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE."""
+def classify_visibility(
+    points: np.ndarray, surface: Surface, cam2world: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Classes (uint8) of world points (..., 3), distances from the camera, and rows and columns of their pixels.
+
+    A point is CONSISTENT with a view's surface, OCCLUDED by it, or in FREE_SPACE.
+    """
     flat = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
-    classes, pose = np.empty(len(flat), np.uint8), np.ascontiguousarray(cam2world)
-    for_point_ranges(partial(_classify_points, flat, surface.inverse_depth, pose, tolerance, classes), len(flat))
-    return classes.reshape(points.shape[:-1])
-
-
-@nb.njit(inline="always")
-def classify_point(point, inverse_depth, cam2world, tolerance):
-    """Class of a world point for one view, its distance from the camera, and the row and column of its pixel."""
-    x, y, z = point[0] - cam2world[0, 3], point[1] - cam2world[1, 3], point[2] - cam2world[2, 3]
-    right = x * cam2world[0, 0] + y * cam2world[1, 0] + z * cam2world[2, 0]
-    down = x * cam2world[0, 1] + y * cam2world[1, 1] + z * cam2world[2, 1]
-    ahead = x * cam2world[0, 2] + y * cam2world[1, 2] + z * cam2world[2, 2]
-    distance = max(math.sqrt(x * x + y * y + z * z), 1e-9)
-    row, column = locate_pixel(right, down, ahead, len(inverse_depth))
-    ratio = 1 / (distance * inverse_depth[row, column])
-    kind = CONSISTENT if ratio > 1 - tolerance else OCCLUDED
-    return FREE_SPACE if ratio > 1 + tolerance else kind, distance, row, column
+    found = np.empty(len(flat), np.uint8), np.empty(len(flat)), np.empty((2, len(flat)), np.int32)
+    pose = np.ascontiguousarray(cam2world, np.float64)
+    for_point_ranges(partial(_classify_points, flat, surface.inverse_depth, pose, tolerance, *found), len(flat))
+    classes, distances, row, column = (each.reshape(points.shape[:-1]) for each in (*found[:2], *found[2]))
+    return classes, distances, (row, column)
 
 
 @cached_njit(nogil=True)
-def _classify_points(points, inverse_depth, cam2world, tolerance, classes, first, end):
+def _classify_points(points, inverse_depth, cam2world, tolerance, classes, distances, pixels, first, end):
     for n in range(first, end):
-        classes[n] = classify_point(points[n], inverse_depth, cam2world, tolerance)[0]
+        point = points[n]
+        x, y, z = point[0] - cam2world[0, 3], point[1] - cam2world[1, 3], point[2] - cam2world[2, 3]
+        right = x * cam2world[0, 0] + y * cam2world[1, 0] + z * cam2world[2, 0]
+        down = x * cam2world[0, 1] + y * cam2world[1, 1] + z * cam2world[2, 1]
+        ahead = x * cam2world[0, 2] + y * cam2world[1, 2] + z * cam2world[2, 2]
+        distance = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        row, column = locate_pixel(right, down, ahead, len(inverse_depth))
+        ratio = 1 / (distance * inverse_depth[row, column])
+        kind = CONSISTENT if ratio > 1 - tolerance else OCCLUDED
+        classes[n] = FREE_SPACE if ratio > 1 + tolerance else kind
+        distances[n], pixels[0, n], pixels[1, n] = distance, row, column
 
 
 def world_points(surface: Surface, cam2world: np.ndarray) -> np.ndarray:
@@ -210,7 +111,8 @@ def consistency_mask(
     points = world_points(surfaces[view], cam2world[view])
     consistent = np.zeros(points.shape[:2], bool)
     for other in others:
-        consistent |= classify_visibility(points, surfaces[other], cam2world[other], _MAX_INCONSISTENCY) == CONSISTENT
+        classes, _, _ = classify_visibility(points, surfaces[other], cam2world[other], _MAX_INCONSISTENCY)
+        consistent |= classes == CONSISTENT
     return consistent
 
 

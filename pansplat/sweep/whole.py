@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float
 
 from pansplat.sweep.joined_crops import crop_axes, crop_panorama, pixel_rays
+from pansplat.sweep.panoramas import nearest_pixel
 from pansplat.sweep.smoothing import as_meridians, smooth_sphere
-from pansplat.sweep.surface import nearest_pixel
 
 # Angles are in radians.
 _BASELINE_ANGLE = math.radians(1.5)  # deviation of the average where depth is the baseline (docs/what_was_tried.md)

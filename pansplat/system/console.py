@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, ParamSpec, TextIO, TypeVar
 
 from pansplat.errors import InputError, InputWarning
+from pansplat.system.allocator import keep_freed_memory
 from pansplat.system.progress import is_progress_shown, show_progress, stage
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def run_command(command: Callable[[], int], *, memory_advice: str, interruption:
         The command's status; 2 for bad input, missing files and exhausted memory or disks, 70 for a defect of pansplat,
         130 after Ctrl+C, 143 after SIGTERM, 141 if the reader of standard output closed it.
     """
+    keep_freed_memory()
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w", encoding="utf-8") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):  # what the terminal's encoding lacks is written as escapes
         with contextlib.suppress(AttributeError, ValueError):

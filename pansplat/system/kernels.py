@@ -4,7 +4,6 @@ Numba caches compiled code on disk, so each kernel is compiled once per machine.
 """
 
 import contextlib
-import gc
 import inspect
 import itertools
 import math
@@ -14,8 +13,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numba as nb
@@ -43,18 +40,26 @@ _OPTIONS = {
     "no_cfunc_wrapper": True,  # the kernels are not called from C
     "fastmath": {"contract", "nsz"},  # no reassociation: results do not depend on the number of threads
 }
-_MESSAGE = "pansplat: compiling kernels for this processor; the first run of each command takes 15 to 30 seconds longer"
-_MESSAGE_DELAY = 1.0  # seconds of compilation before the message
+_MESSAGE = "pansplat: compiling kernels for this processor, once; this takes up to 30 seconds"
 _message_shown = False
-_cache_folder: Path | None = None  # folder of the compiled kernels; None without a cache
+
+
+def _announce(compiled: Any) -> None:
+    """Print a message on stderr, once per process, before the first kernel of a cache folder is compiled."""
+    global _message_shown
+    is_ours = compiled.py_func.__module__.startswith("pansplat.")
+    folder = find_cache_folder(compiled) if is_ours and not _message_shown else None
+    if folder is not None and not any(folder.glob("*.nbi")):
+        _message_shown = True
+        print(_MESSAGE, file=sys.stderr, flush=True)
+
+
+notify_of_compilation(_announce)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function at its first call, to run without the interpreter lock, and cache the code on disk."""
-    global _cache_folder
-    compiled = cached_njit(**_OPTIONS)(function)
-    _cache_folder = find_cache_folder(compiled) or _cache_folder
-    return compiled
+    return cached_njit(**_OPTIONS)(function)
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -115,61 +120,6 @@ def fast_atan2(y, x):
     r = np.float32(math.pi / 2) - r if ay > ax else r
     r = np.float32(math.pi) - r if x < 0 else r
     return -r if y < 0 else r
-
-
-@contextlib.contextmanager
-def announce_compilation() -> Iterator[None]:
-    """Print a message on stderr if kernels are compiled inside for more than a second, unless it was printed before.
-
-    The delay counts from the first of several kernels. Garbage collection pauses meanwhile: compilation makes millions
-    of objects and little garbage, whose collection would take a tenth of the time.
-    """
-    timer: threading.Timer | None = None
-    collection_paused = False
-
-    def start(module: str) -> None:
-        nonlocal timer, collection_paused
-        if timer is None and module.startswith("pansplat."):
-            timer = threading.Timer(_MESSAGE_DELAY, partial(_show_message, _find_package(module)))
-            timer.daemon = True
-            timer.start()
-            collection_paused = gc.isenabled()
-            gc.disable()
-
-    try:
-        with notify_of_compilation(start):
-            yield
-    finally:
-        if timer is not None:
-            timer.cancel()
-        if collection_paused:
-            gc.enable()
-
-
-def _show_message(package: str) -> None:
-    """Print the message once per process, and once per cache of a package's kernels, which several commands fill."""
-    global _message_shown
-    if not _message_shown:
-        _message_shown = True
-        if _cache_folder is None or _mark(_cache_folder, package):
-            print(_MESSAGE, file=sys.stderr, flush=True)
-
-
-def hide_message() -> None:
-    """Print no message in this process."""
-    global _message_shown
-    _message_shown = True
-
-
-def _mark(folder: Path, package: str) -> bool:
-    """Leave a mark of this version of a package's kernels in their cache; whether there was none."""
-    try:
-        (folder / f"announced-{nb.__version__}-{hash_sources(package, (*_INLINED, package))}").touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    except OSError:
-        pass  # a folder that cannot be written has no mark
-    return True
 
 
 # --- worker threads ---

@@ -4,14 +4,13 @@ It exists in numba 0.60 to 0.68, the versions that pyproject.toml allows; tests/
 later version lacks.
 """
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numba.core import types as types
 from numba.core.cgutils import get_or_insert_function as get_or_insert_function
-from numba.core.event import Listener, install_listener
+from numba.core.event import Listener, register
 from numba.core.typing.templates import ConcreteTemplate as ConcreteTemplate
 from numba.core.typing.templates import infer_global as infer_global
 from numba.core.typing.templates import signature as signature
@@ -37,24 +36,21 @@ def share_literal_versions(compiled: Any) -> None:
 
 
 class _Notifier(Listener):
-    """Calls a function with the name of the module of what is compiled."""
+    """Calls a function with what is compiled."""
 
-    def __init__(self, notify: Callable[[str], None]) -> None:
+    def __init__(self, notify: Callable[[Any], None]) -> None:
         self._notify = notify
 
     def on_start(self, event: Any) -> None:
-        self._notify(event.data["dispatcher"].py_func.__module__)
+        self._notify(event.data["dispatcher"])
 
     def on_end(self, event: Any) -> None:
         pass
 
 
-@contextlib.contextmanager
-def notify_of_compilation(notify: Callable[[str], None]) -> Iterator[None]:
-    """Within the block, call `notify` with the name of a function's module when its compilation begins."""
-
-    with install_listener("numba:compile", _Notifier(notify)):
-        yield
+def notify_of_compilation(notify: Callable[[Any], None]) -> None:
+    """From now on, call `notify` with each function whose compilation begins."""
+    register("numba:compile", _Notifier(notify))
 
 
 def processor_features(context: Any) -> list[str]:

@@ -83,9 +83,9 @@ class Store:
         paths = (folder / f"{kind}-{hash_parts(_FORMAT, key)}{_SUFFIX}" for folder in self._folders)
         return [path for path in paths if os.path.isfile(path)]
 
-    def read(self, kind: str, key: str, is_valid: Callable[[Any], bool] = lambda value: True) -> Any:
-        """The value of an entry; None if there is none, with a note if it is damaged or not valid."""
-        found = (self._open(path, is_valid) for path in self.find(kind, key))
+    def read(self, kind: str, key: str) -> Any:
+        """The value of an entry; None if there is none, with a note if it is damaged."""
+        found = (self._open(path) for path in self.find(kind, key))
         return next((value for value in found if value is not None), None)
 
     def list_values(self, kind: str) -> list[Any]:
@@ -101,12 +101,10 @@ class Store:
             _used.add(str(written))
             _prune(written.parent)
 
-    def _open(self, path: Path, is_valid: Callable[[Any], bool] = lambda value: True) -> Any:
+    def _open(self, path: Path) -> Any:
         try:
             value = read_entry(path, self._types)
-            if not is_valid(value):
-                raise ValueError
-        except Exception:  # a damaged file may have any content
+        except InputError:
             if path.exists():  # another process may have removed it
                 warnings.warn(f"{path} is damaged, and is computed again.", InputWarning, stacklevel=4)
             return None

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from pansplat.constants import MAX_FOV_DEGREES, MIN_FOV_DEGREES
 from pansplat.errors import InputError
-from pansplat.geometry.path import turn_axes
+from pansplat.geometry.level import turn_axes
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import read_json
 from pansplat.tours.graph import TourGraph

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import find_direction, level_pose, up_direction
+from pansplat.geometry.level import find_direction, level_pose, up_direction
 from pansplat.inputs.panorama_sets import FAR, NEAR, Link, Panorama, PanoramaSet
 from pansplat.inputs.placements import ApproximatePlace
 from pansplat.system.components import label_components

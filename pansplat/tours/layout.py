@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from pansplat.geometry.path import level_pose, up_direction
+from pansplat.geometry.level import level_pose, up_direction
 from pansplat.inputs.panorama_sets import Panorama
 
 REACH = 2.0  # metres in which a camera moves around the panoramas of its part

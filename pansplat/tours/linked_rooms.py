@@ -13,14 +13,14 @@ from jaxtyping import Float
 from shapely import Geometry
 from shapely.geometry import Point, Polygon
 
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.tours.floor import assign_storeys
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import RAY_DIRECTIONS, Outline, meet_outline
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
 _ASIDE, _LINK_ERROR = range(-180, 180, 6), 12.0  # tried and usual angles between a door and its link, degrees
-_THICKNESS, _STEP = 0.08, 0.45  # thickness of a wall between two rooms; distance of a dot from the wall before it
+WALL_THICKNESS, _STEP = 0.08, 0.45  # thickness of a wall between two rooms; distance of a dot from the wall before it
 _MOST_OVERLAP, _PUSH = 0.01, 0.1  # largest share of a room that is in others; length of a step away from them
 _APART, _FARTHEST = 9.0, 200.0  # cost of a unit away from the door; least cost of a place that is not used
 _PLACE_ERROR, _TURN_ERROR = 0.5, 0.25  # usual errors of a stated place, and of its turn, radians
@@ -156,7 +156,7 @@ def _find_motion(
         found = [(0.0, stated.turn or 0.0, stated.shift, away / max(np.linalg.norm(away), 1e-9))]
     for here, there in itertools.product(doors, _find_doors(second, _measure_azimuth(tour, back)) if doors else ()):
         turn = wrap_angle(math.atan2(*-here[1]) - math.atan2(*there[1]))
-        shift = here[0] + _THICKNESS * unit * here[1] - there[0] @ turn_plan(turn)
+        shift = here[0] + WALL_THICKNESS * unit * here[1] - there[0] @ turn_plan(turn)
         cost = here[2] + there[2]
         if stated is not None:
             away = np.linalg.norm(second.place @ turn_plan(turn) + shift - stated.move(second.place)) / unit

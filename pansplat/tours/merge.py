@@ -12,7 +12,7 @@ import torch
 
 from pansplat.gaussians.crop import keep_gaussians
 from pansplat.gaussians.scene import Gains, Gaussians, Scene, SceneTour, Starts
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.inputs.placements import PLACED, ApproximatePlace, Placement
 from pansplat.tours.edges import find_walls

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from pansplat.geometry.path import turn_axes, wrap_angle
+from pansplat.geometry.level import turn_axes, wrap_angle
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.outlook import find_bins, find_turns, find_widest
 

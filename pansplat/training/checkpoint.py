@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,8 +14,8 @@ from typing import Annotated, Any
 import torch
 from msgspec import Meta, Struct
 
-from pansplat.errors import InputError, InputWarning
-from pansplat.networks.weights import UnsafeCheckpointError, read_checkpoint
+from pansplat.errors import InputError
+from pansplat.networks.weights import read_checkpoint
 from pansplat.system.atomic import replacing
 from pansplat.system.strict_json import convert
 
@@ -76,44 +75,31 @@ def restore(state: Mapping[str, Any], key: str, apply: Callable[[Any], object]) 
 def load_latest(
     folder: Path, restore: Callable[[Path, dict[str, Any]], None] | None = None
 ) -> tuple[Path, dict[str, Any]] | None:
-    """Path and content of the newest usable checkpoint; None if there are no checkpoints.
-
-    Deletes incomplete files. Skips damaged checkpoints with a warning that names the previous one, which is used.
+    """Path and content of the newest checkpoint; None if there are none. Deletes incomplete files.
 
     Args:
-        restore: restores a run from a path and its content; a `DamagedCheckpointError` skips the checkpoint.
+        restore: restores a run from a path and its content.
 
     Raises:
-        UnsafeCheckpointError: a checkpoint contains code.
+        InputError: the checkpoint is damaged, or `restore` raises it.
     """
     if folder.is_dir():
         for partial in folder.glob(".step_*.pt"):
             partial.unlink(missing_ok=True)
     found = list_checkpoints(folder)
-    failures = []
-    for index, path in reversed(list(enumerate(found))):
-        try:
-            content = load_checkpoint(path)
-        except UnsafeCheckpointError:
-            raise
-        except InputError as error:
-            problem = str(error)
-        else:
-            try:
-                if restore is not None:
-                    restore(path, content)
-                return path, content
-            except DamagedCheckpointError as error:
-                problem = f"{path}: {error}"
-        failures.append(problem)
-        previous = f"the previous one is {found[index - 1]}" if index else "there is no previous one"
-        warnings.warn(f"skipped a checkpoint: {problem}; {previous}", InputWarning, stacklevel=2)
-    if failures:
-        raise InputError(
-            f"{folder}: needed a readable checkpoint, got none: {'; '.join(failures)}; give another --out, or delete "
-            "this folder to start again"
-        )
-    return None
+    if not found:
+        return None
+    path, remedy = found[-1], f"delete it to {f'resume from {found[-2]}' if found[1:] else 'start again'}."
+    try:
+        content = load_checkpoint(path)
+    except InputError as error:
+        raise InputError(f"{str(error).rstrip('.')}; or {remedy}") from error
+    try:
+        if restore is not None:
+            restore(path, content)
+    except DamagedCheckpointError as error:
+        raise InputError(f"{path}: {error}; {remedy}") from error
+    return path, content
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

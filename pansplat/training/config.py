@@ -194,52 +194,37 @@ def _differences(old: object, new: object, name: str = "") -> list[str]:
 
 # Presets: the stages of the paper (docs/official.md, section 14), and small models. The paper's presets have the loss
 # weights of the official code, with which the published checkpoints were trained. Numbers of steps follow from epochs,
-# numbers of samples and batch sizes.
+# numbers of samples (19,950 triplets of Matterport3D, 13 training sequences of 360Loc) and batch sizes.
 
-_TRIPLETS = 19_950  # training samples of Matterport3D
-_SEQUENCES = 13  # training sequences of 360Loc
 _MATTERPORT = DataConfig(kind="panogrf", workers=10, augmentation=False)
+_LOC360 = DataConfig(kind="360loc", workers=10, augmentation=False, training_gap="original")
+_TEN_DRAWS = replace(_LOC360, draws=10)
 _PLAIN = MemoryConfig(style="cubemap")
 _TILED_2X2 = MemoryConfig("two-step", 2, "cubemap")
 _TILED_4X4 = MemoryConfig("two-step", 4, "cubemap")
-_FROZEN = ("features", "cost_volume")
+_HEADS_ONLY = NetworkConfig(frozen=("features", "cost_volume"))
 _WITHOUT_DEPTH = replace(CODE, depth=0.0)
 
 
-def _matterport_preset(
+def _paper_preset(
+    data: DataConfig,
     height: int,
     batch: int,
-    epochs: int,
+    steps: int,
     loss: LossWeights,
     network: NetworkConfig,
     memory: MemoryConfig,
-    validations: int = 1,
+    every: int = 1000,
 ) -> TrainConfig:
-    steps_per_epoch = _TRIPLETS // batch
     return TrainConfig(
         heights=(height,),
         perceptual="lpips-vgg",
         loss=loss,
-        data=_MATTERPORT,
+        data=data,
         network=network,
-        memory=memory,
-        optimizer=OptimizerConfig(steps=epochs * steps_per_epoch, batch_size=batch),
-        validation=ValidationConfig(every=int(steps_per_epoch / validations)),
-    )
-
-
-def _loc360_preset(
-    height: int, batch: int, epochs: int, draws: int, network: NetworkConfig, memory: MemoryConfig
-) -> TrainConfig:
-    steps_per_epoch = _SEQUENCES * draws // batch
-    return TrainConfig(
-        heights=(height,),
-        perceptual="lpips-vgg",
-        loss=_WITHOUT_DEPTH,
-        data=DataConfig(kind="360loc", draws=draws, workers=10, augmentation=False, training_gap="original"),
-        network=network,
-        memory=replace(memory, mixing="by_view"),
-        optimizer=OptimizerConfig(steps=max(1, epochs * steps_per_epoch), batch_size=batch),
+        memory=replace(memory, mixing="joint" if data is _MATTERPORT else "by_view"),
+        optimizer=OptimizerConfig(steps=steps, batch_size=batch),
+        validation=ValidationConfig(every=every),
     )
 
 
@@ -269,31 +254,31 @@ _PRESETS: dict[str, tuple[str, TrainConfig]] = {
     ),
     "pansplat-256": (
         "the paper's first stage, Matterport3D at 256x512; --network.init must hold the monocular network's weights",
-        _matterport_preset(256, 6, 10, CODE, NetworkConfig(), _PLAIN),
+        _paper_preset(_MATTERPORT, 256, 6, 10 * 3325, CODE, NetworkConfig(), _PLAIN, 3325),
     ),
     "pansplat-512": (
         "the paper's second stage, 512x1024, from the first",
-        _matterport_preset(512, 2, 5, CODE, NetworkConfig(), _PLAIN),
+        _paper_preset(_MATTERPORT, 512, 2, 5 * 9975, CODE, NetworkConfig(), _PLAIN, 9975),
     ),
     "pansplat-1024": (
         "heads only, 1024x2048, two-step, 2x2 tiles, from pansplat-512",
-        _matterport_preset(1024, 3, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_2X2, 2),
+        _paper_preset(_MATTERPORT, 1024, 3, 3 * 6650, _WITHOUT_DEPTH, _HEADS_ONLY, _TILED_2X2, 3325),
     ),
     "pansplat-2048": (
         "heads only, 2048x4096, two-step, 4x4 tiles, from pansplat-512",
-        _matterport_preset(2048, 1, 3, _WITHOUT_DEPTH, NetworkConfig(frozen=_FROZEN), _TILED_4X4, 2),
+        _paper_preset(_MATTERPORT, 2048, 1, 3 * 19_950, _WITHOUT_DEPTH, _HEADS_ONLY, _TILED_4X4, 9975),
     ),
     "pansplat-512-360loc": (
         "360Loc, 512x1024, with auxiliary heads, from pansplat-512",
-        _loc360_preset(512, 2, 5, 1000, NetworkConfig(auxiliary=True), _PLAIN),
+        _paper_preset(_LOC360, 512, 2, 5 * 6500, _WITHOUT_DEPTH, NetworkConfig(auxiliary=True), _PLAIN),
     ),
     "pansplat-1024-360loc": (
         "heads only, 1024x2048, from pansplat-512-360loc",
-        _loc360_preset(1024, 3, 200, 10, NetworkConfig(frozen=_FROZEN), _TILED_2X2),
+        _paper_preset(_TEN_DRAWS, 1024, 3, 200 * 43, _WITHOUT_DEPTH, _HEADS_ONLY, _TILED_2X2),
     ),
     "pansplat-2048-360loc": (
         "heads only, 2048x4096, from pansplat-1024-360loc",
-        _loc360_preset(2048, 1, 100, 10, NetworkConfig(frozen=_FROZEN), _TILED_4X4),
+        _paper_preset(_TEN_DRAWS, 2048, 1, 100 * 130, _WITHOUT_DEPTH, _HEADS_ONLY, _TILED_4X4),
     ),
 }
 

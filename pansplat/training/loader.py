@@ -11,9 +11,7 @@ import multiprocessing
 import signal
 import sys
 import warnings
-from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing.context import BaseContext
 
@@ -27,13 +25,8 @@ from pansplat.training.sources import SampleSource
 
 _MAX_FAILURES = 32  # consecutive unreadable samples before an error
 
-
-@dataclass(frozen=True)
-class Skipped:
-    """A sample that could not be read; `message` names the file and the reason."""
-
-    index: int
-    message: str
+Read = tuple[Sample | None, list[str]]
+"""A sample, and why others that it replaces could not be read; None if too many in a row could not."""
 
 
 class Loader:
@@ -48,7 +41,7 @@ class Loader:
         augmentation: whether samples are changed at random.
 
     Attributes:
-        skipped: by message, the number of times that an unreadable sample was skipped. The first time it warns.
+        skipped: why samples could not be read, with their files. The first time it warns.
     """
 
     def __init__(
@@ -67,7 +60,7 @@ class Loader:
             raise InputError(f"needed batch_size >= 1 and workers >= 0, got {batch_size} and {workers}.")
         self.reader = _Reader(source, height, seed, augmentation)
         self.batch_size, self.workers = batch_size, workers
-        self.skipped: Counter[str] = Counter()
+        self.skipped: set[str] = set()
 
     def batches(self, step: int = 0) -> Iterator[Batch]:
         """Infinite batches, starting at a step."""
@@ -80,10 +73,15 @@ class Loader:
             multiprocessing_context=_worker_context() if self.workers else None,
         )
         for read in loader:
-            self._count(itertools.chain.from_iterable(skipped for _, skipped in read))
-            samples = [sample for sample, _ in read if sample is not None]
-            if len(samples) < len(read):
-                raise InputError(self._describe_failures([skipped for _, skipped in read]))
+            samples: list[Sample] = []
+            for sample, failures in read:
+                self._report(failures)
+                if sample is None:
+                    raise InputError(
+                        f"needed readable samples, got {len(failures)} consecutive unreadable ones (of "
+                        f"{len(self.reader.source)}); check the first of them: {failures[0]}"
+                    )
+                samples.append(sample)
             yield collate(samples)
 
     def _positions(self, step: int) -> Iterable[list[int]]:
@@ -91,22 +89,12 @@ class Loader:
             first = number * self.batch_size
             yield list(range(first, first + self.batch_size))
 
-    def _count(self, skipped: Iterable[Skipped]) -> None:
-        for failure in skipped:
-            self.skipped[failure.message] += 1
-            if self.skipped[failure.message] == 1:
-                warnings.warn(
-                    f"skipped sample {failure.index} ({len(self.skipped)} unreadable so far): {failure.message}",
-                    stacklevel=3,
-                )
-
-    def _describe_failures(self, failures: list[list[Skipped]]) -> str:
-        worst = max(failures, key=len)
-        examples = "\n  ".join(dict.fromkeys(failure.message for failure in worst[:3]))
-        return (
-            f"needed readable samples, got {len(worst)} consecutive unreadable ones (of {len(self.reader.source)}); "
-            f"check the first of them:\n  {examples}"
-        )
+    def _report(self, failures: list[str]) -> None:
+        """Warn of failures that are new."""
+        for failure in failures:
+            if failure not in self.skipped:
+                self.skipped.add(failure)
+                warnings.warn(f"skipped a sample ({len(self.skipped)} unreadable so far): {failure}", stacklevel=3)
 
 
 def _ignore_interrupts(_: int) -> None:
@@ -114,24 +102,24 @@ def _ignore_interrupts(_: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-class _Reader(Dataset[tuple[Sample | None, list[Skipped]]]):
+class _Reader(Dataset[Read]):
     """The sample at a position of the infinite sequence of epochs, and the samples that were skipped for it."""
 
     def __init__(self, source: SampleSource, height: int, seed: int, augmentation: bool) -> None:
         self.source, self.height, self.seed, self.augmentation = source, height, seed, augmentation
 
-    def __getitem__(self, position: int) -> tuple[Sample | None, list[Skipped]]:
+    def __getitem__(self, position: int) -> Read:
         count = len(self.source)
         epoch, place = divmod(position, count)
         order = _permutation(self.seed, epoch, count)
-        skipped: list[Skipped] = []
+        failures: list[str] = []
         for k in range(min(count, _MAX_FAILURES)):  # the next sample of the epoch replaces an unreadable one
             index = int(order[(place + k) % count])
             try:
-                return self._read(epoch, index, place), skipped
+                return self._read(epoch, index, place), failures
             except (InputError, OSError) as error:
-                skipped.append(Skipped(index, str(error)))
-        return None, skipped
+                failures.append(str(error))
+        return None, failures
 
     def _read(self, epoch: int, index: int, place: int) -> Sample:
         """The sample at an index. The seed includes `place`, so that two reads of a sample in one epoch differ."""
@@ -145,7 +133,7 @@ def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng((seed, epoch)).permutation(count)
 
 
-def _identity(read: list[tuple[Sample | None, list[Skipped]]]) -> list[tuple[Sample | None, list[Skipped]]]:
+def _identity(read: list[Read]) -> list[Read]:
     return read
 
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -87,14 +88,12 @@ def plot_run(folder: Path) -> Path | None:
     return path
 
 
-def _running_means(values: list[float]) -> list[float]:
+def _running_means(values: list[float]) -> np.ndarray:
     """Means over each value and the ones before it, in a window of a 20th of all values."""
-    width = max(1, math.ceil(len(values) / _SMOOTHING))
-    means = []
-    for end in range(1, len(values) + 1):
-        window = values[max(0, end - width) : end]
-        means.append(sum(window) / len(window))
-    return means
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - math.ceil(len(values) / _SMOOTHING), 0)
+    sums = np.cumsum([0.0, *values])
+    return (sums[ends] - sums[starts]) / (ends - starts)
 
 
 class ProgressDisplay:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pansplat.errors import InputError
-from pansplat.evaluation.lpips import Backbone, find_backbone, load_lpips
+from pansplat.evaluation.lpips import Backbone, Lpips, find_backbone, load_lpips
 from pansplat.geometry.equirect import pad_equirect
 from pansplat.system.options import Weight
 
@@ -61,7 +61,7 @@ class ImageLoss:
 def image_loss(
     prediction: Images,
     target: Images,
-    perceptual: Perceptual | None,
+    perceptual: Lpips | Structure | None,
     weights: LossWeights = PAPER,
     *,
     pixel_weights: PixelWeights | None = None,
@@ -133,7 +133,7 @@ def _nearest(maps: Tensor, size: Sequence[int]) -> Tensor:
 def auxiliary_loss(
     images: Sequence[Images],
     target: Images,
-    perceptual: Perceptual | None,
+    perceptual: Lpips | Structure | None,
     weights: LossWeights = PAPER,
     *,
     pixel_weights: PixelWeights | None = None,
@@ -164,26 +164,9 @@ _C1, _C2 = 0.01**2, 0.03**2  # squares of SSIM's K1 and K2, for images in [0, 1]
 _BACKBONES: dict[str, Backbone] = {"lpips-vgg": "vgg", "lpips-alex": "alex", "lpips-squeeze": "squeeze"}
 
 
-@runtime_checkable
-class Perceptual(Protocol):
-    """A differentiable distance between two images; 0 for equal images.
-
-    Attributes:
-        name: such as "lpips-vgg" or "structure".
-    """
-
-    name: str
-
-    def __call__(
-        self, prediction: Images, target: Images, weights: PixelWeights | None = None
-    ) -> Float[Tensor, "batch"]:
-        """One distance per pair of images. Pixels of weight 0 have no effect."""
-        ...
-
-
 def choose_perceptual(
     name: PerceptualName = "auto", folder: Path | None = None, device: torch.device | None = None
-) -> Perceptual:
+) -> Lpips | Structure:
     """The distance of a name; "auto" selects LPIPS with vgg, alex or squeeze if its files are found, else "structure".
 
     Args:
@@ -215,7 +198,7 @@ class Structure:
     def __call__(
         self, prediction: Images, target: Images, weights: PixelWeights | None = None
     ) -> Float[Tensor, "batch"]:
-        """See `Perceptual`; for panoramas in [0, 1]."""
+        """One distance per pair of panoramas in [0, 1]. Pixels of weight 0 have no effect."""
         pixel_weights = torch.ones_like(target[:, :1]) if weights is None else weights[:, None].to(target)
         prediction = torch.where(pixel_weights > 0, prediction, target)
         total, scales = target.new_zeros(len(target)), 0

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from pansplat.evaluation.lpips import Lpips
 from pansplat.inputs.views import Batch
 from pansplat.model.heads import AuxiliaryHeads, MatchedViews
 from pansplat.model.pansplat import PanSplat
 from pansplat.training.config import MemoryConfig
 from pansplat.training.deferred import LossTerms, Problem, backpropagate, whole_loss
-from pansplat.training.losses import LossWeights, Perceptual, auxiliary_loss, depth_loss, image_loss
+from pansplat.training.losses import LossWeights, Structure, auxiliary_loss, depth_loss, image_loss
 from pansplat.training.network import matching_is_trainable
 from pansplat.training.rendering import TargetRenderer
 
@@ -30,7 +31,7 @@ class TrainingStep:
 
     network: PanSplat
     auxiliary: AuxiliaryHeads | None
-    perceptual: Perceptual | None
+    perceptual: Lpips | Structure | None
     weights: LossWeights
     memory: MemoryConfig
 

@@ -41,7 +41,6 @@ from pansplat.training.stopping import StopRequest
 from pansplat.training.validation import MEASURES, describe_measures, validate
 
 _EXTRA_STEPS = 10  # steps of the learning rate's schedule beyond the last step, as in the official code
-_TINY_SECONDS = 0.7  # time of a step of `tiny` on two cores (docs/training.md)
 _COLUMNS = (*LOSS_TERMS, "rate", "gradient_norm", "seconds")
 
 
@@ -93,7 +92,7 @@ class Trainer:
         self.average = ExponentialMovingAverage(self.network, config.optimizer.ema) if config.optimizer.ema else None
         perceptual = choose_perceptual(config.perceptual, device=self.device)
         self._training_step = TrainingStep(self.network, self.auxiliary, perceptual, config.loss, config.memory)
-        self.perceptual_name = getattr(perceptual, "name", "none")
+        self.perceptual_name = perceptual.name
         self.step = 0
         latest = load_latest(self.folder, self._restore)
         self.resumed_from = None if latest is None else latest[0]
@@ -259,12 +258,9 @@ class Trainer:
 
     def _describe(self) -> str:
         count = sum(p.numel() for p in trainable_parameters(self.network, self.auxiliary))
-        left = (self.config.optimizer.steps - self.step) * _TINY_SECONDS / 60
-        is_tiny = self.config.network.shape == "tiny" and self.config.heights == (64,)
-        duration = f", about {left:.0f} min on two cores" if is_tiny else ""
         return (
             f"{self.config.network.shape}: {count:,} trainable parameters, "
             f"{self.config.data.kind} at {', '.join(f'{h}x{2 * h}' for h in self.config.heights)}, "
             f"perceptual loss {self.perceptual_name}, "
-            f"from step {self.step} of {self.config.optimizer.steps}{duration}"
+            f"from step {self.step} of {self.config.optimizer.steps}"
         )

@@ -13,7 +13,7 @@ from PIL import Image
 from pansplat import pipeline
 from pansplat.cli import run
 from pansplat.geometry.equirect import rotate_equirect
-from pansplat.geometry.path import level_axes
+from pansplat.geometry.level import level_axes
 from pansplat.images.image_files import read_depth
 from pansplat.rendering import Rendering
 from pansplat.tours.graph import find_tours

@@ -7,11 +7,9 @@ import pytest
 
 _CHECK = """
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from numba.core.caching import NullCache
 from numba.core.dispatcher import Dispatcher
 from pansplat.cli import warm_up
-warm_up.ProcessPoolExecutor = lambda count, context: ThreadPoolExecutor(1)  # so that this process holds the kernels
 warm_up.main()
 packages = "pansplat.rendering.cpu", "pansplat.sweep", "pansplat.refinement"
 modules = [m for name, m in sys.modules.items() if name.startswith(packages)]

@@ -160,21 +160,10 @@ def _in_parts(scene: Scene, *bounds: int) -> Iterator[Gaussians]:
 
 
 @pytest.mark.parametrize("bounds", [(), (20,), (7, 7, 33), (1, 59)])
-@pytest.mark.parametrize("size", [4096, 3])
-def test_parts_give_the_same_file_as_the_whole(tmp_path: Path, monkeypatch, scene, bounds, size) -> None:
-    monkeypatch.setattr(ply, "_RUNS_SPACE", size)  # 3 bytes are too few for a run: the vertices are moved
+def test_parts_give_the_same_file_as_the_whole(tmp_path: Path, scene, bounds) -> None:
     save_ply(scene, tmp_path / "whole.ply")
     assert save_ply_parts(scene, _in_parts(scene, *bounds), tmp_path / "parts.ply") == 60
-    (whole_header, whole_body), (header, body) = (_split_file(tmp_path / f"{name}.ply") for name in ("whole", "parts"))
-    assert body == whole_body
-    assert [line.rstrip() for line in header.splitlines()] == whole_header.splitlines()
-    assert len(header) < 10_000  # some viewers search only so far for the end of the header
-    whole, parts = load_ply(tmp_path / "whole.ply"), load_ply(tmp_path / "parts.ply")
-    assert torch.equal(whole.gaussians.levels, parts.gaussians.levels)
-    assert torch.equal(whole.gaussians.views, parts.gaussians.views)
-    assert torch.equal(whole.cam2world, parts.cam2world)
-    for name in ("near", "far", "names", "model", "height"):
-        assert getattr(parts, name) == getattr(scene, name)
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["parts.ply", "whole.ply"]
 
 

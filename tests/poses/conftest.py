@@ -13,7 +13,7 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.solvers import rotation_exp
-from pansplat.sweep.surface import upright_rotation
+from pansplat.sweep.panoramas import upright_rotation
 
 _HALF = np.array((2.6, 1.35, 2.1))  # half the size of a room, metres
 

@@ -172,7 +172,10 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     every = Features(bearings, descriptors, np.ones(400), np.full(400, 1e-3))
     learned = LearnedFeatures(-bearings[:3], torch.zeros(3, 128), torch.zeros(3, 2), (0, 3, 3, 3, 3))
     found = Matches(np.array(((2, 1), (0, 2))), np.array((0.99, 0.4)))
-    monkeypatch.setattr("pansplat.poses.estimate.match_learned", lambda matcher, first, second: found)
+    asked: list[int] = []
+    monkeypatch.setattr(
+        "pansplat.poses.estimate.match_learned", lambda *_, least_common: asked.append(least_common) or found
+    )
     few, many = (_view(every.strongest(count), np.zeros((64, 128), np.float32), learned) for count in (20, 400))
     joined = _match(few, few, object())
     assert len(joined) == 22 and (np.diff(joined.prior) <= 0).all()
@@ -180,6 +183,8 @@ def test_the_learned_matcher_is_asked_where_sift_hardly_suffices(monkeypatch: py
     assert joined.indices[own].tolist() == [[22, 21], [20, 22]] and joined.prior[own].tolist() == [0.7, 0.4]
     assert np.allclose(few.matched.bearings[20:], -bearings[:3]) and len(few.joined) == 43
     assert _match(many, many, object()).indices.max() < 400
+    _match(few, few, object(), is_linked=True)
+    assert len(asked) == 2 and asked[0] > asked[1] == 0  # a link states that two panoramas have something in common
 
 
 def test_pairs_are_left_out_within_a_group_that_certain_pairs_connect(monkeypatch: pytest.MonkeyPatch) -> None:

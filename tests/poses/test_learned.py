@@ -16,6 +16,7 @@ from pansplat.poses.features import Matches
 from pansplat.poses.learned import (
     LearnedFeatures,
     Matcher,
+    count_common,
     detect_learned,
     load_matcher,
     match_learned,
@@ -124,6 +125,12 @@ def test_masked_pixels_have_no_features(matcher: Matcher, render_room: Callable[
     longitude = np.degrees(np.arctan2(features.bearings[:, 0], features.bearings[:, 2]))
     assert len(features) > 50
     assert (longitude < 300 / 512 * 360 - 180 + 1e-6).all()
+
+
+def test_panoramas_with_little_in_common_have_no_matches(matcher: Matcher, room: tuple) -> None:
+    common = int(np.sort(count_common(*room[:2]), axis=None)[-6:].sum())
+    assert len(match_learned(matcher, *room[:2], least_common=common)) > 0
+    assert len(match_learned(matcher, *room[:2], least_common=common + 1)) == 0
 
 
 def test_a_panorama_of_one_colour_has_no_matches(matcher: Matcher, room: tuple) -> None:

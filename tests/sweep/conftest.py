@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from pansplat.sweep.panoramas import ray_grid, resize_sphere
 from pansplat.sweep.search import SearchConfig, observe, search
-from pansplat.sweep.surface import PosedImages, Surface, ray_grid, resize_sphere
+from pansplat.sweep.surface import PosedImages, Surface
 
 
 def _waves(points: np.ndarray) -> np.ndarray:

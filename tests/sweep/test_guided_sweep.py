@@ -17,7 +17,7 @@ from pansplat.networks.weights import pack_weights, save_weights
 from pansplat.pipeline import load_model, load_predictor, load_sets, predict, render
 from pansplat.prediction_options import PredictOptions
 from pansplat.sweep.guided_sweep import NetworkPrior, default_weights, load_guided_sweep, save_network
-from pansplat.sweep.surface import resize_sphere
+from pansplat.sweep.panoramas import resize_sphere
 
 _OF_A_VIEW = ("images", "masks", "cam2world")
 _CONFIG = RefinementConfig(

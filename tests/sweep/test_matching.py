@@ -7,7 +7,7 @@ import pytest
 
 from pansplat.sweep.matching import (
     HypothesisSet,
-    MatchingConfig,
+    MatchingWeights,
     OtherView,
     View,
     _aggregate_columns,
@@ -16,9 +16,9 @@ from pansplat.sweep.matching import (
     compute_matching_cost,
     select_labels,
 )
-from pansplat.sweep.surface import ray_grid
+from pansplat.sweep.panoramas import ray_grid
 
-_PLAIN = MatchingConfig(textureless_weight=1.0, distance_penalty=0.0)
+_PLAIN = MatchingWeights(textureless_weight=1.0, distance_penalty=0.0)
 _IMPOSSIBLE = 2 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 _NEUTRAL = 0.5 * (_PLAIN.correlation_weight + _PLAIN.color_weight)
 
@@ -39,11 +39,11 @@ def _view(image: np.ndarray, valid: np.ndarray | None = None, inverse: float | N
     )
 
 
-def _cost(views, *sets, pose=None, limits=(0.1, 2.0), config=_PLAIN) -> np.ndarray:
+def _cost(views, *sets, pose=None, limits=(0.1, 2.0), weights=_PLAIN) -> np.ndarray:
     """Cost of a view against another, by default with the same pose."""
     view, *others = views
     pose = np.eye(4) if pose is None else pose
-    return compute_matching_cost(view, [OtherView(o, pose, list(sets)) for o in others], limits, config)
+    return compute_matching_cost(view, [OtherView(o, pose, list(sets)) for o in others], limits, weights)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +104,7 @@ def test_the_other_views_surface_changes_the_cost_as_configured(twice):
     """A penalty in free space, a bonus when consistent, a constant cost when occluded."""
     image, spheres = twice[0].image, _spheres((0.25, 0.5, 0.75, 1.0))
     cost = _cost((twice[0], _view(image, inverse=0.5)), spheres)
-    config = _PLAIN
-    expected = (config.occluded_cost, -config.consistency_bonus, config.free_space_penalty, config.free_space_penalty)
+    expected = (_PLAIN.occluded_cost, -_PLAIN.consistency_bonus, *[_PLAIN.free_space_penalty] * 2)
     assert np.allclose(cost, expected, atol=0.02)
     assert _cost((twice[0], _view(image)), spheres).max() < 0.02  # nothing is known before the first pass
 
@@ -125,9 +124,9 @@ def test_penalties_are_added_and_a_window_without_texture_has_less_weight(twice)
     penalty = np.array((0.0, 0.3), np.float32)
     assert np.allclose(_cost(twice, dataclasses.replace(_spheres((0.25, 0.5)), penalty=penalty)), penalty, atol=0.02)
     # White against grey: the colour difference is truncated, the correlation is undefined.
-    flat, config = [_view(np.full((32, 64, 3), value)) for value in (1.0, 0.5)], MatchingConfig()
-    cost, weight = _cost(flat, _spheres((0.25, 0.5), 32), config=config), config.textureless_weight
-    assert np.allclose(cost, weight * config.color_weight + (1 - weight) * config.textureless_cost, atol=1e-3)
+    flat, weights = [_view(np.full((32, 64, 3), value)) for value in (1.0, 0.5)], MatchingWeights()
+    cost, weight = _cost(flat, _spheres((0.25, 0.5), 32), weights=weights), weights.textureless_weight
+    assert np.allclose(cost, weight * weights.color_weight + (1 - weight) * weights.textureless_cost, atol=1e-3)
 
 
 def _two_metres_apart(inverses) -> tuple[np.ndarray, np.ndarray]:
@@ -140,9 +139,10 @@ def _two_metres_apart(inverses) -> tuple[np.ndarray, np.ndarray]:
 def test_points_much_nearer_to_one_camera_than_to_the_other_are_penalised(views):
     inverses = np.array((0.25, 2.0, 3.75), np.float32)
     pose, there = _two_metres_apart(inverses)
-    penalised = dataclasses.replace(_PLAIN, distance_penalty=0.5)
+    penalised = _PLAIN._replace(distance_penalty=0.5)
     plain, far_apart = (
-        _cost(views, _spheres(inverses), pose=pose, limits=(0.1, 4.0), config=config) for config in (_PLAIN, penalised)
+        _cost(views, _spheres(inverses), pose=pose, limits=(0.1, 4.0), weights=weights)
+        for weights in (_PLAIN, penalised)
     )
     ratio = np.linalg.norm(there, axis=-1) * inverses
     expected = 0.5 * np.maximum(1 - penalised.distance_ratio * np.minimum(ratio, 1 / ratio), 0)

@@ -6,9 +6,9 @@ import pytest
 from pansplat.sweep import prior as prior_module
 from pansplat.sweep import search as search_module
 from pansplat.sweep.matching import HypothesisSet, View
+from pansplat.sweep.panoramas import ray_grid, resize_sphere, upright_rotation
 from pansplat.sweep.prior import DepthPrior, PriorEstimator, apply_prior_cost
 from pansplat.sweep.search import SearchConfig, observe, search
-from pansplat.sweep.surface import ray_grid, resize_sphere, upright_rotation
 
 _CAMERA_HEIGHT = 1.2  # of `Room.high` over y = 0, metres
 _DOWN = np.array((0.0, 1.0, 0.0))

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from pansplat.geometry.equirect import uv_from_directions
+from pansplat.sweep.panoramas import nearest_pixel, ray_grid, resize_sphere
 from pansplat.sweep.surface import (
     CONSISTENT,
     FREE_SPACE,
@@ -13,9 +14,6 @@ from pansplat.sweep.surface import (
     classify_visibility,
     consistency_mask,
     guided_upsample,
-    nearest_pixel,
-    ray_grid,
-    resize_sphere,
 )
 
 
@@ -35,8 +33,8 @@ def test_points_in_front_of_on_and_behind_a_surface_are_classified(turn):
     for expected, distances in classes.items():
         for distance in distances:
             points = pose[:3, 3] + distance * directions
-            assert (classify_visibility(points, _sphere(2.0), pose, 0.06) == expected).all()
-    assert classify_visibility(pose[None, :3, 3], _sphere(2.0), pose, 0.06).tolist() == [FREE_SPACE]  # the camera
+            assert (classify_visibility(points, _sphere(2.0), pose, 0.06)[0] == expected).all()
+    assert classify_visibility(pose[None, :3, 3], _sphere(2.0), pose, 0.06)[0].tolist() == [FREE_SPACE]  # the camera
 
 
 def test_exact_surfaces_are_inconsistent_only_at_occlusions(empty_room, furnished_room, view):

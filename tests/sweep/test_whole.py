@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pansplat.sweep.surface import ray_grid
+from pansplat.sweep.panoramas import ray_grid
 from pansplat.sweep.whole import find_segments, make_whole
 
 _HEIGHT = 128

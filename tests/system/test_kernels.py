@@ -13,7 +13,6 @@ import torch
 from pansplat.system import kernels, source_hash
 from pansplat.system.kernels import (
     Workspace,
-    announce_compilation,
     cached_njit,
     kernel,
     parallel_for,
@@ -28,49 +27,17 @@ def _add_indices(x):
     return x
 
 
-def _compile_as_part_of(module):
-    function = type(_add_indices)(_add_indices.__code__, {"range": range})
-    function.__module__ = module
-    nb.njit(function)(1.0)
-
-
-class _Timer:
-    """Ends at once or never; the thread of a real timer may not run before the kernels are compiled."""
-
-    def __init__(self, delay, function):
-        self.start = function if delay == 0.0 else lambda: None
-        self.cancel = lambda: None
-
-
-@pytest.fixture
-def count_messages(monkeypatch, capsys, tmp_path):
-    """A function that compiles two kernels as in a new process, and counts the messages."""
-    monkeypatch.setattr(kernels, "_cache_folder", tmp_path)
-    monkeypatch.setattr(threading, "Timer", _Timer)
-
-    def run(delay, module):
-        monkeypatch.setattr(kernels, "_MESSAGE_DELAY", delay)
+@pytest.mark.parametrize(("module", "messages"), [("pansplat.rendering.cpu.projection", [1, 0]), ("else", [0, 0])])
+def test_only_the_first_compilation_of_pansplat_kernels_is_announced(module, messages, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(kernels, "find_cache_folder", lambda compiled: tmp_path)
+    for count in messages:  # in as many processes
         monkeypatch.setattr(kernels, "_message_shown", False)
-        with announce_compilation():
-            for _ in range(2):
-                _compile_as_part_of(module)
-        assert gc.isenabled()
-        return capsys.readouterr().err.count("compiling kernels for this processor")
-
-    return run
-
-
-def test_long_compilation_of_pansplat_kernels_is_announced_once_until_they_change(count_messages, monkeypatch):
-    module = "pansplat.rendering.cpu.projection"
-    assert count_messages(100.0, module) == count_messages(0.0, "elsewhere") == 0
-    assert [count_messages(0.0, module) for _ in range(2)] == [1, 0], "also in later processes"
-    monkeypatch.setattr(kernels.nb, "__version__", "another one")
-    assert count_messages(0.0, module) == 1
-
-
-def test_without_a_writable_cache_every_process_announces_it(count_messages, monkeypatch, tmp_path):
-    monkeypatch.setattr(kernels, "_cache_folder", tmp_path / "missing")
-    assert [count_messages(0.0, "pansplat.rendering.cpu.projection") for _ in range(2)] == [1, 1]
+        for _ in range(2):
+            function = type(_add_indices)(_add_indices.__code__, {"range": range})
+            function.__module__ = module
+            nb.njit(function)(1.0)
+        (tmp_path / "kernel.nbi").touch()
+        assert capsys.readouterr().err.count("compiling kernels for this processor") == count
 
 
 @pytest.mark.parametrize("decorate", [kernel, cached_njit(nogil=True)])

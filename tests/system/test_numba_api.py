@@ -6,7 +6,7 @@ import pytest
 from pansplat.system.kernels import kernel
 
 _OF_NUMBA = (
-    *("core.event.install_listener", "core.event.Listener", "core.types.unliteral"),
+    *("core.event.register", "core.event.Listener", "core.types.unliteral"),
     "core.codegen.JITCPUCodegen.magic_tuple",
     *(f"core.cpu.CPUTargetOptions.{option}" for option in ("no_cfunc_wrapper", "no_cpython_wrapper", "forceinline")),
     "core.cpu.CPUTargetOptions._nrt",

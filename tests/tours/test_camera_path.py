@@ -8,7 +8,7 @@ import torch
 from msgspec import structs
 
 from pansplat.errors import InputError
-from pansplat.geometry.path import turn_axes
+from pansplat.geometry.level import turn_axes
 from pansplat.geometry.world import WorldFrame
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.camera_path import CameraPath, KeyFrame, read_path, write_path

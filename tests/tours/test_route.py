@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.geometry.path import find_direction, turn_axes
+from pansplat.geometry.level import find_direction, turn_axes
 from pansplat.inputs.folders import load_sets
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours.floor import assign_storeys

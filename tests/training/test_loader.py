@@ -1,4 +1,4 @@
-"""Batches are determined by seed and step; unreadable samples are skipped, counted and named."""
+"""Batches are determined by seed and step; unreadable samples are skipped, and named once."""
 
 import itertools
 import json
@@ -60,18 +60,17 @@ def test_batches_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     assert not _equal(_take(Loader(source, **(options | {"seed": 2})), 3), alone)
 
 
-def test_unreadable_samples_are_skipped_counted_and_named(tmp_path: Path) -> None:
+def test_unreadable_samples_are_skipped_and_named_once(tmp_path: Path) -> None:
     source = _triplets(tmp_path, 6)
     (tmp_path / "2_1.png").write_bytes(b"")
     (tmp_path / "4_0.png").write_bytes((tmp_path / "4_0.png").read_bytes()[:40])
     loader = Loader(source, height=8, batch_size=3)
-    with pytest.warns(UserWarning, match="skipped sample") as caught:
+    with pytest.warns(UserWarning, match="skipped a sample") as caught:
         batches = _take(loader, 4)
     assert all(len(batch) == 3 for batch in batches)
     assert not {"2", "4"} & {name for batch in batches for name in batch.names}
     assert len(caught) == 2 and any("2_1.png" in str(w.message) for w in caught)
     assert sorted(message.split(":")[0].rsplit("/")[-1] for message in loader.skipped) == ["2_1.png", "4_0.png"]
-    assert all(count >= 2 for count in loader.skipped.values())  # in each of the two epochs
     with pytest.warns(UserWarning):
         assert _equal(_take(Loader(source, height=8, batch_size=3), 2, step=2), batches[2:])
 
@@ -82,7 +81,7 @@ def test_an_error_names_files_when_all_samples_are_unreadable(tmp_path: Path) ->
         path.write_bytes(b"")
     with (
         pytest.warns(UserWarning, match="skipped"),
-        pytest.raises(InputError, match=r"got 4 consecutive unreadable ones \(of 4\)(.|\n)*_1\.png"),
+        pytest.raises(InputError, match=r"got 4 consecutive unreadable ones \(of 4\).*_1\.png"),
     ):
         _take(Loader(source, height=8, batch_size=1), 1)
 

@@ -18,7 +18,7 @@ from imgui_bundle import imgui
 from pansplat import pipeline
 from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.path import find_direction
+from pansplat.geometry.level import find_direction
 from pansplat.images.image_files import write_image
 from pansplat.inputs.folders import load_panoramas
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet

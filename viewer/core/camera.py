@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from pansplat.constants import FILTER_VARIANCE, MAX_FOV_DEGREES, MAX_PITCH_DEGREES, MIN_FOV_DEGREES
 from pansplat.geometry.cubemap import face_rotations
-from pansplat.geometry.path import turn_axes
+from pansplat.geometry.level import turn_axes
 
 MAX_PITCH_RADIANS = math.radians(MAX_PITCH_DEGREES)
 MIN_DISTANCE = 0.05  # metres, from the orbit centre

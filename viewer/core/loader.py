@@ -161,13 +161,28 @@ def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panor
     return sorted((view.in_frame(USER_FRAME) for view in views), key=lambda view: view.name)
 
 
+def load_whole(entry: SceneEntry, prediction: PredictOptions) -> "tuple[Scene, PanoramaSet | TourGraph | None]":
+    """The scene of all panoramas of an entry, and these; None of a scene file."""
+    from pansplat import pipeline
+    from pansplat.tours.overlap import connect
+
+    if entry.file is not None:
+        return pipeline.load(entry.file), None
+    source = entry.pair
+    if entry.tour is not None:
+        with stage(CONNECTED):
+            source = connect(entry.tour)
+    assert source is not None
+    return pipeline.predict(source, options=prediction), source
+
+
 def load_entry(
     entry: SceneEntry, prediction: PredictOptions, show: Callable[[LoadedScene], None] | None = None
 ) -> LoadedScene:
     """Read an entry's scene, or predict and refine it. Of a tour, a scene of the panorama in which `plan_walk` starts.
 
-    The entry of the result for a tour has its connected graph and the panoramas of the scene. With `show`, that is the
-    scene of an edge, which is there soon; else it is that of a part, which the scenes of its edges are selected from.
+    The entry of the result for a tour has its connected graph and the panoramas of the scene: of an edge, which is
+    there soon.
 
     Args:
         entry: the entry.
@@ -233,11 +248,9 @@ def _load_tour_scene(
         with stage(CONNECTED):
             connected, max_views = connect(tour), pipeline.find_max_views(predictor)
         # A window shows photographs before: they begin where the graph that is not connected yet does.
-        first, views = _choose_first_scene(connected, connected if show is None else tour)
-        tour, part = link_parts(connected), choose_predictions(connected, max_views).get(first, views)
-        if show is None:
-            views = part
-        elif views != part:
+        first, views = _choose_first_scene(connected, tour)
+        tour = link_parts(connected)
+        if views != choose_predictions(connected, max_views).get(first, views):
             prediction = replace(prediction, refine_steps=0)
         entry = replace(entry, tour=tour, views=views, start=first, max_views=max_views)
     pair = entry.pair or tour.make_set(views)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pansplat.errors import InputError
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import Piece, PlanFrame, PlanPose, find_wall_yaw, read_piece

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from pansplat.constants import NEAR
 from pansplat.gaussians.scene import Scene
-from pansplat.geometry.path import level_axes
+from pansplat.geometry.level import level_axes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.limits import limit_step

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from imgui_bundle import imgui
 
-from pansplat.geometry.path import find_direction
+from pansplat.geometry.level import find_direction
 from pansplat_viewer.core.picking import project_point
 from pansplat_viewer.ui.widgets import Widgets
 

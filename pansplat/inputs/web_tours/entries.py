@@ -17,7 +17,7 @@ import torch
 from msgspec import Meta
 
 from pansplat.errors import InputError, InputWarning
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.images.cube_images import MAX_SIZE, CubeImage, CubeLevel, write_cube
 from pansplat.inputs.panorama_sets import Link, Note, Panorama, find_mask
 from pansplat.inputs.stated_files import locate_inside

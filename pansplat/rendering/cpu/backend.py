@@ -31,7 +31,7 @@ from pansplat.rendering.cpu.tiling import (
 from pansplat.rendering.cpu.view import CameraView, Statistics, make_camera
 from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import RasterOptions
-from pansplat.system.kernels import Workspace, announce_compilation, pooled_empty, thread_count
+from pansplat.system.kernels import Workspace, pooled_empty, thread_count
 
 
 class _PlaneState(NamedTuple):
@@ -89,14 +89,13 @@ class _Rasterize(torch.autograd.Function):
         gaussians, camera = GaussianArrays.from_tensors(tensors), make_camera(pose, planes[0], near)
         threads, workspace = thread_count(), Workspace()
         needs_grad = grad_enabled and any(ctx.needs_input_grad)  # needs_input_grad itself ignores no_grad
-        with announce_compilation():
-            projected = project_gaussians(gaussians, camera, workspace, threads)
-            view = CameraView(gaussians, camera, projected, threads)
-            sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
-            states = [
-                rasterize_plane(view, plane, plane_sums, Statistics(), workspace if needs_grad else None)
-                for plane, plane_sums in zip(planes, sums, strict=True)
-            ]
+        projected = project_gaussians(gaussians, camera, workspace, threads)
+        view = CameraView(gaussians, camera, projected, threads)
+        sums = pooled_empty((len(planes), VALUE_LANES + 1, *planes[0].size), np.float32)
+        states = [
+            rasterize_plane(view, plane, plane_sums, Statistics(), workspace if needs_grad else None)
+            for plane, plane_sums in zip(planes, sums, strict=True)
+        ]
         result = torch.from_numpy(sums)
         if needs_grad:  # the workspace is kept because it owns the arrays of `projected` and `states`
             ctx.save_for_backward(*tensors, pose, result)
@@ -116,16 +115,15 @@ class _Rasterize(torch.autograd.Function):
             torch.from_numpy(pooled_empty(tuple(tensor.shape), np.float32)) if is_needed else None
             for tensor, is_needed in zip(tensors, needed, strict=True)
         ]
-        with announce_compilation():
-            workspace = Workspace()
-            grad_sums = grad_outputs[0].contiguous().numpy()
-            slots = _backpropagate_planes(view, planes, states, sums.numpy(), grad_sums, workspace)
-            outputs = (
-                np.empty((0, *array.shape[1:]), np.float32) if grad is None else grad.numpy()
-                for array, grad in zip(gaussians, grads, strict=True)
-            )
-            gradients = GaussianGradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
-            gradients = backpropagate_projection(gaussians, camera, projected, *slots, gradients, threads)
+        workspace = Workspace()
+        grad_sums = grad_outputs[0].contiguous().numpy()
+        slots = _backpropagate_planes(view, planes, states, sums.numpy(), grad_sums, workspace)
+        outputs = (
+            np.empty((0, *array.shape[1:]), np.float32) if grad is None else grad.numpy()
+            for array, grad in zip(gaussians, grads, strict=True)
+        )
+        gradients = GaussianGradients(*outputs, pose=np.empty((3 if needs_pose else 0, 4)))
+        gradients = backpropagate_projection(gaussians, camera, projected, *slots, gradients, threads)
         grad_pose = None
         if needs_pose:
             grad_pose = torch.zeros_like(pose)

@@ -27,7 +27,6 @@ from pansplat.rendering.image_planes import ImagePlane
 from pansplat.rendering.rasterize import normalise_sums
 from pansplat.system.kernels import (
     Workspace,
-    announce_compilation,
     inline_kernel,
     kernel,
     parallel_for,
@@ -167,19 +166,18 @@ class DisplayScene:
         pose[:3, 3] = torch.from_numpy(np.asarray(position, np.float64))
         camera = make_camera(pose, plane, near)
         sums = pooled_empty((num_layers, 5, *plane.size), np.float32)
-        with announce_compilation():
-            with statistics.timed("select"):
-                gaussians, ends = self._select(camera.pose[:3, 3], labels, num_layers, selection, workspace)
-            with statistics.timed("project"):
-                projected = project_gaussians(gaussians, camera, workspace, threads, shift)
-            start = 0
-            for end, layer_sums in zip(ends, sums, strict=True):
-                part = slice(start, end)
-                layer = ProjectedGaussians(*(array[part] for array in projected))
-                arrays = GaussianArrays(*(array[part] for array in gaussians))
-                view = CameraView(arrays, camera, layer, threads, min_transmittance)
-                rasterize_plane(view, plane, layer_sums, statistics)
-                start = end
+        with statistics.timed("select"):
+            gaussians, ends = self._select(camera.pose[:3, 3], labels, num_layers, selection, workspace)
+        with statistics.timed("project"):
+            projected = project_gaussians(gaussians, camera, workspace, threads, shift)
+        start = 0
+        for end, layer_sums in zip(ends, sums, strict=True):
+            part = slice(start, end)
+            layer = ProjectedGaussians(*(array[part] for array in projected))
+            arrays = GaussianArrays(*(array[part] for array in gaussians))
+            view = CameraView(arrays, camera, layer, threads, min_transmittance)
+            rasterize_plane(view, plane, layer_sums, statistics)
+            start = end
         return Layers(sums, ends[-1] if ends else 0, statistics)
 
     def _select(
@@ -329,8 +327,7 @@ def blend_to_pixels(
     work = partial(
         _blend_rows, sums, np.asarray(weights, np.float32), np.array(background, np.float32), bottom_up, pixels
     )
-    with announce_compilation():
-        parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
+    parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
 
 
 @kernel
@@ -421,8 +418,7 @@ class PixelFaces:
         to_faces = np.ascontiguousarray(face_rotations().numpy().transpose(0, 2, 1) @ rotation)
         focals = np.float64(self.focal), np.float64(focal)
         work = partial(_sample_rows, self.pixels, *focals, to_faces, bottom_up, pixels)
-        with announce_compilation():
-            parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
+        parallel_for(work, -(-pixels.shape[0] // _ROWS_PER_ITEM), thread_count())
 
 
 @kernel

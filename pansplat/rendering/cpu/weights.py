@@ -71,7 +71,6 @@ from pansplat.rendering.cpu.view import make_camera
 from pansplat.rendering.image_planes import image_planes
 from pansplat.system.kernels import (
     Workspace,
-    announce_compilation,
     inline_kernel_no_refcount,
     kernel,
     pooled_empty,
@@ -120,15 +119,14 @@ class StoredWeights:
         tensors = tuple(field.detach().contiguous() for field in fields)
         arrays, camera = GaussianArrays.from_tensors(tensors), make_camera(cam2world.double(), plane, NEAR)
         self._workspace, self._tables = Workspace(), tabulate_pixels(plane)
-        with announce_compilation():
-            projected = project_gaussians(arrays, camera, self._workspace, self._threads)
-            boxes = find_bounding_boxes(projected.records, plane, self._workspace, self._threads)
-            self._scene = projected.records.reshape(-1), projected.values
-            self._bands = list(
-                intersect_tiles(boxes, size, slots=True, threads=self._threads, limit=MAX_BAND_INTERSECTIONS)
-            )
-            for tiles in self._bands:
-                sort_front_to_back(tiles, projected.radii, self._threads)
+        projected = project_gaussians(arrays, camera, self._workspace, self._threads)
+        boxes = find_bounding_boxes(projected.records, plane, self._workspace, self._threads)
+        self._scene = projected.records.reshape(-1), projected.values
+        self._bands = list(
+            intersect_tiles(boxes, size, slots=True, threads=self._threads, limit=MAX_BAND_INTERSECTIONS)
+        )
+        for tiles in self._bands:
+            sort_front_to_back(tiles, projected.radii, self._threads)
         self._stored: dict[int, _Pairs] = {}
         self._free = MAX_STORED_PAIRS
 
@@ -140,8 +138,7 @@ class StoredWeights:
                 pairs = _allocate_pairs(tiles, self._threads)
                 scene = *self._scene, tiles.intersections.reshape(-1), tiles.starts
                 arguments = *scene, *self._tables, *pairs[:-1], tiles.first_row
-                with announce_compilation():
-                    parallel_for_tiles(_compute_weights, arguments, tiles.starts, self._threads)
+                parallel_for_tiles(_compute_weights, arguments, tiles.starts, self._threads)
                 if len(pairs.members) <= self._free:
                     self._stored[tiles.first_row] = pairs
                     self._free -= len(pairs.members)

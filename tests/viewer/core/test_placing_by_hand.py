@@ -15,7 +15,7 @@ import torch
 import pansplat
 from pansplat.errors import InputError
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.path import wrap_angle
+from pansplat.geometry.level import wrap_angle
 from pansplat.inputs.panorama_sets import Panorama
 from pansplat.inputs.placements import Placement
 from pansplat.poses.dense import Surroundings

@@ -11,11 +11,14 @@ import pytest
 import torch
 from PIL import Image
 
-from pansplat.export.film import Film, Shot
+from pansplat.export.film import Film, Shot, plan_visits
+from pansplat.gaussians.scene import Scene
 from pansplat.tours.cross_fade import CrossFade
-from pansplat.tours.route import FADE_SECONDS, REST_SECONDS, plan_route
-from pansplat.tours.walks import plan_walk
-from pansplat_viewer import capture, run
+from pansplat.tours.facts import TourFacts
+from pansplat.tours.graph import TourGraph
+from pansplat.tours.merge import merge_scenes
+from pansplat.tours.route import FADE_SECONDS, plan_route
+from pansplat_viewer import run
 from pansplat_viewer.capture import open_film, write_flight
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.hotspots import find_hotspots
@@ -100,18 +103,6 @@ def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
         scenes.add(loaded)
     assert scenes.tour.poor == ((0, 1),), "each edge once, and no others"
     assert scenes.plan_way(camera, (1,)).steps[0].kind == "zoom"
-
-
-def test_a_film_of_a_tour_zooms_along_an_edge_that_its_first_scene_shows_poor(house, load_house, tmp_path, monkeypatch):
-    first = SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
-    loaded = load_house(first)
-    vars(loaded.facts).update(poor=[(0, 1)])
-    shots = []
-    monkeypatch.setattr(capture, "write_film", lambda path, film, frames, fps, show: shots.extend(frames))
-    write_flight(None, loaded, TourScenes.start(loaded), tmp_path, 12, None, lambda file: None)
-    steps = {shot.moment.step for shot in shots}
-    assert {step.kind for step in steps if set(step.nodes) == {0, 1}} >= {"zoom"}
-    assert "flight" not in {step.kind for step in steps if set(step.nodes) == {0, 1}}
 
 
 def test_a_zoom_shows_both_photographs_and_ends_in_that_of_its_goal(parted_house):
@@ -251,20 +242,21 @@ def test_scenes_of_other_parts_are_loaded_next_those_of_links_first(parted_house
 
 
 @pytest.fixture
-def open_tour_film(load_house) -> Iterator[Callable[..., Film]]:
-    """Opens the film of a tour's scenes, without photographs."""
+def open_tour_film(load_house) -> Iterator[Callable[[TourGraph], tuple[Film, Scene]]]:
+    """Opens the film of a tour, without photographs, and returns the scene, too."""
     with contextlib.ExitStack() as stack:
 
-        def open_one(scenes: TourScenes, load: Callable = load_house, size: tuple[int, int] = (64, 36)) -> Film:
-            first, settings = load_house(scenes.make_entry(scenes.views)), DrawSettings(mode="deferred")
-            settings = replace(settings, levels=frozenset(range(8)))  # all, but without photographs
-            return stack.enter_context(open_film(lambda: CpuRenderer(None), first, scenes, load, size, settings))
+        def open_one(tour: TourGraph) -> tuple[Film, Scene]:
+            entries, settings = TourScenes(tour), DrawSettings(mode="deferred")
+            scene = merge_scenes(tour, lambda views: load_house(entries.make_entry(views)).scene)
+            film = open_film(lambda: CpuRenderer(None), scene, None, (64, 36), settings)
+            return stack.enter_context(film), scene
 
         yield open_one
 
 
 def test_the_film_of_a_zoom_mixes_the_views_of_both_panoramas(parted_house, open_tour_film):
-    film = open_tour_film(TourScenes(parted_house))
+    film, _ = open_tour_film(parted_house)
     route = plan_route(parted_house, [2, 3])
     zoom = route.steps[0]
 
@@ -284,32 +276,34 @@ def read_film(path) -> np.ndarray:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]).astype(float)
 
 
-def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, load_house, scenes, open_tour_film, tmp_path):
-    loaded = []
-
-    def load(entry):
-        loaded.append(entry.views)
-        return load_house(entry)
-
-    route = plan_route(house, plan_walk(house, 0), rest=REST_SECONDS)
+def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, open_tour_film, tmp_path):
     written, complete = [], []
 
     def show_file(file):
         written.append(file.name)
         complete.append((tmp_path / "film.mp4").exists())
 
-    film = open_tour_film(scenes, load)
-    write_flight(film, scenes.get((0, 1)), scenes, tmp_path, 12, None, show_file)
+    film, scene = open_tour_film(house)
+    facts = TourFacts(scene)
+    vars(facts)["poor"] = ()  # the scenes are made up
+    write_flight(film, facts, tmp_path, 12, None, show_file)
     names = [f"{node + 1:02d}_{house.panoramas[node].name}.png" for node in range(4)]
     assert written == [*names, "film.mp4"] and complete == [False] * 4 + [True]
     frames = read_film(tmp_path / "film.mp4")
     with Image.open(tmp_path / names[0]) as still:
         assert np.abs(np.asarray(still).astype(float) - frames[0]).mean() < 6, "the still of the first panorama"
-    assert len(frames) == round(12 * route.seconds) and loaded == [(1, 2), (2, 3)]
+    assert len(frames) == round(12 * plan_visits(facts).seconds)
     assert frames.max(-1).min() > 40, "no black"
     steps = np.abs(np.diff(frames, axis=0)).mean((1, 2, 3))
     change = np.abs(frames[0].mean((0, 1)) - frames[-1].mean((0, 1))).mean()
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
+
+
+def test_a_film_zooms_along_a_poor_edge(house, open_tour_film):
+    facts = TourFacts(open_tour_film(house)[1])
+    vars(facts)["poor"] = ((0, 1),)
+    kinds = [step.kind for step in plan_visits(facts).steps if set(step.nodes) == {0, 1}]
+    assert "zoom" in kinds and "flight" not in kinds
 
 
 @pytest.mark.gl
@@ -317,10 +311,9 @@ def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house,
     rows = {p.image.name: p.cam2world.tolist() for p in house.panoramas}
     (house.folder / "poses.json").write_text(str({"convention": "cam2world opencv", "poses": rows}).replace("'", '"'))
 
-    def predict(pair, *_, options, **__):
-        views = tuple(int(panorama.name[-1]) for panorama in pair.context)
-        assert options.height == 128
-        return load_house(TourScenes(house).make_entry(views)).scene
+    def predict(tour, *, options):
+        entries = TourScenes(tour)
+        return merge_scenes(tour, lambda views: load_house(entries.make_entry(views)).scene)
 
     monkeypatch.setattr("pansplat.pipeline.predict", predict)
     monkeypatch.setattr("pansplat.tours.overlap.connect", lambda tour: replace(tour, overlaps=house.overlaps))

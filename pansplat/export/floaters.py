@@ -1,14 +1,6 @@
-"""Scenes before they are shared: cropped to a box, and without floaters.
-
-Each step states how many Gaussians it leaves out, and how much the pictures at the cameras change.
-"""
+"""Floaters: isolated Gaussians in free space, which a scene may leave out before it is shared."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy
@@ -18,14 +10,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from pansplat.errors import InputError
-from pansplat.gaussians.crop import Box, crop, keep_gaussians
+from pansplat.gaussians.crop import keep_gaussians
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.geometry.equirect import pad_equirect, row_weights
-from pansplat.pipeline import render
+from pansplat.geometry.equirect import pad_equirect
 from pansplat.refinement.fusion import OPAQUE, look_up
 from pansplat.rendering import rasterize
-from pansplat.system.descriptions import describe_count
-from pansplat.system.progress import report_progress, stage
 
 _NEIGHBOURS = 16  # Gaussians beside a Gaussian, in the directions of its camera, that are compared with it
 _CHUNK = 1 << 17  # Gaussians whose neighbours are searched at once
@@ -34,88 +23,6 @@ _MIN_COMPANIONS = 2  # least neighbours at the same distance of a Gaussian that 
 _CONFIRMED = 0.03  # largest distance to a Gaussian of another camera that confirms one, over that to its own camera
 _IN_FRONT = 0.85  # largest distance of a floater from its camera, over that of the surface behind it
 _DEPTH_ROWS = 512  # most rows of the image of that surface
-_PICTURE_ROWS = 256  # most rows of the pictures that are compared before and after
-_MAX_PICTURES = 16  # cameras at which pictures are compared
-
-
-@dataclass(frozen=True)
-class Change:
-    """What a step did.
-
-    Attributes:
-        step: its name.
-        before, after: numbers of Gaussians.
-        cameras: numbers of cameras, before and after.
-        psnr: of the pictures at the remaining cameras against those before, dB; infinite if they are equal, None
-            without cameras.
-    """
-
-    step: str
-    before: int
-    after: int
-    cameras: tuple[int, int]
-    psnr: float | None
-
-    def __str__(self) -> str:
-        text = f"{self.step}: {self.before - self.after:,} of {self.before:,} Gaussians left out"
-        if self.cameras[0] > self.cameras[1]:
-            text += f", and {self.cameras[0] - self.cameras[1]} of {describe_count(self.cameras[0], 'camera')}"
-        if self.psnr is None:
-            return text
-        where = f"the picture{'s' if self.cameras[1] > 1 else ''} at the {describe_count(self.cameras[1], 'camera')}"
-        if math.isinf(self.psnr):
-            return f"{text}; {where} did not change"
-        return f"{text}; {where} before and after agree to {self.psnr:.1f} dB"
-
-
-@stage()
-def clean_up(scene: Scene, box: Box | None = None, *, floaters: bool = True) -> tuple[Scene, list[Change]]:
-    """The scene after the steps, and what each of them did.
-
-    Args:
-        scene: with each surface once, or not.
-        box: that it is cropped to.
-        floaters: whether they are kept.
-    """
-    steps: dict[str, Callable[[Scene], Scene]] = {}
-    if box is not None:
-        steps["crop"] = partial(crop, box=box)
-    if not floaters:
-        steps["floaters"] = remove_floaters
-    changes = []
-    for number, (name, step) in enumerate(steps.items()):
-        report_progress(name, number / len(steps))
-        cleaned = step(scene)
-        counts = len(scene.gaussians), len(cleaned.gaussians)
-        cameras = len(scene.cam2world), len(cleaned.cam2world)
-        changes.append(Change(name, *counts, cameras, compare_pictures(scene, cleaned)))
-        scene = cleaned
-    return scene, changes
-
-
-@torch.no_grad()
-def compare_pictures(before: Scene, after: Scene) -> float | None:
-    """PSNR of the panoramas at the cameras of one scene against those of another one, over all of at most 16 cameras.
-
-    Returns:
-        dB, weighted by solid angle; infinite if they are equal, None without cameras.
-    """
-    count = len(after.cam2world)
-    if not count:
-        return None
-    if len(before.gaussians) == len(after.gaussians) and len(before.cam2world) == count:
-        return math.inf
-    rows = min(after.height, _PICTURE_ROWS)
-    weights, errors = row_weights(rows), []
-    for number in np.unique(np.linspace(0, count - 1, min(count, _MAX_PICTURES)).round().astype(int)).tolist():
-        pose = after.cam2world[number]
-        first, second = (
-            render(scene, pose, size=(rows, 2 * rows)).color.clamp(0, 1).double() for scene in (before, after)
-        )
-        error = (first - second).square().mean(dim=(0, 2)).cpu()
-        errors.append(float((error * weights).sum() / weights.sum()))
-    mean = sum(errors) / len(errors)
-    return -10 * math.log10(mean) if mean > 0 else math.inf
 
 
 def remove_floaters(scene: Scene) -> Scene:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pansplat.geometry.path import level_axes, level_pose, look_pose, up_direction
+from pansplat.geometry.level import level_axes, level_pose, look_pose, up_direction
 from pansplat.geometry.pose import orthonormal_error
 
 
