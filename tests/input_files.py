@@ -22,7 +22,7 @@ from pansplat.cli.render import read_pose
 from pansplat.errors import InputError, collect_notes
 from pansplat.gaussians.formats import load_scene, save_scene
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
-from pansplat.gaussians.scene_files import format_entry, make_scene
+from pansplat.gaussians.scene_files import format_entry, restore_scene
 from pansplat.images.cube_images import CubeImage, CubeLevel, write_cube
 from pansplat.images.image_files import read_depth, read_height, read_panorama, write_image
 from pansplat.inputs.folders import load_panoramas, load_sets
@@ -172,7 +172,7 @@ def _make_comment(folder: Path) -> InputFile:
 
     def read(path: Path) -> str:
         with collect_notes() as notes:
-            scene = make_scene(SCENE.gaussians, path.read_text(errors="replace"), path)
+            scene = restore_scene(SCENE.gaussians, path.read_text(errors="replace"), path)
         assert len(scene.gaussians) == 12 and scene.gaussians.views.max() < max(len(scene.cam2world), 1)
         return "\n".join(notes).replace("levels and views", "runs")
 

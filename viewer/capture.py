@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pansplat.export.film import Film, FilmPhotographs, Shot, choose_scenes, list_flight, plan_visits, write_film
+from pansplat.export.film import Film, FilmPhotographs, Shot, choose_scenes, list_frames, plan_visits, write_film
 from pansplat.gaussians.scene import Scene
 from pansplat.images.image_files import write_image
 from pansplat.inputs.panorama_sets import PanoramaSet
@@ -86,7 +86,7 @@ def write_flight(
         film: of the scene.
         facts: of the scene.
         folder: created if it does not exist.
-        fps, seconds: see `list_flight`.
+        fps, seconds: see `list_frames`.
         show_file: called with each file that is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ def write_flight(
         visits, names = {k: k / _ORBIT_STILLS for k in range(_ORBIT_STILLS)}, ["view"] * _ORBIT_STILLS
     else:
         route = plan_visits(facts)
-        shots, visits = list_flight(route, fps, FIELD_OF_VIEW, seconds), route.visits
+        shots, visits = list_frames(route, fps, FIELD_OF_VIEW, seconds), route.visits
         names = [panorama.label for panorama in facts.tour.panoramas]
     stills: dict[int, list[str]] = {}
     for node, at in visits.items():

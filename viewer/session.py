@@ -17,12 +17,12 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.geometry.level import find_direction
 from pansplat.inputs.panorama_sets import Panorama
-from pansplat.tours.merge import list_starts
 from pansplat.tours.route import REST_SECONDS, Route
+from pansplat.tours.scene_graph import list_starts
 from pansplat_viewer.core import camera as cameras
 from pansplat_viewer.core.hotspots import PlaceFacts
 from pansplat_viewer.core.loader import Find, LoadedScene, SceneEntry, SceneLoader, choose_entry
-from pansplat_viewer.core.state import ViewerState, advance_flight, enter_scene, limit_camera
+from pansplat_viewer.core.state import ViewerState, advance_route, enter_scene, limit_camera
 from pansplat_viewer.core.tour_scenes import TourScenes, plan_way
 from pansplat_viewer.ui.photograph_textures import find_open_view
 from pansplat_viewer.ui.stage import Stage
@@ -342,7 +342,7 @@ class Session:
     def _list_remaining(self) -> tuple[int, ...]:
         """The panoramas that a route still visits; none if the camera follows none."""
         route, state = self._state.route, self._state
-        return route.list_remaining(state.flight) if route is not None and state.playing else ()
+        return route.list_remaining(state.route_fraction) if route is not None and state.playing else ()
 
     def update(self) -> None:
         """Show the scene of the camera's place, and load those that are next."""
@@ -356,7 +356,7 @@ class Session:
         self._stage.fade.move(state.camera.cam2world, tour.part)
         if self._loads_for_tour:
             loader = self.loader
-            request = tour.choose_request(tour.list_next(route, state.flight), loader.entry)
+            request = tour.choose_request(tour.list_next(route, state.route_fraction), loader.entry)
             if request is not None:
                 loader.request(request)
 
@@ -382,17 +382,20 @@ class Session:
         if route is None:
             return
         if state.target is not None:
-            state.route, state.flight, state.playing = self._plan_way((state.target,)), 0.0, True
+            state.route, state.route_fraction, state.playing = self._plan_way((state.target,)), 0.0, True
         elif state.playing and not was_playing:
-            if state.flight == 0:
+            if state.route_fraction == 0:
                 state.route = self._plan_way((), REST_SECONDS)
-            elif not np.allclose(state.camera.cam2world, route.pose(state.flight), atol=1e-4):
-                state.route, state.flight = self._plan_way(route.list_remaining(state.flight), REST_SECONDS), 0.0
+            elif not np.allclose(state.camera.cam2world, route.pose(state.route_fraction), atol=1e-4):
+                state.route, state.route_fraction = (
+                    self._plan_way(route.list_remaining(state.route_fraction), REST_SECONDS),
+                    0.0,
+                )
         state.target = None
         for node in self._list_remaining()[:2]:  # photographs are read before they are shown
             self._stage.get_photograph(node)
         if not (state.is_zooming and self._stage.photographs.is_reading):
-            advance_flight(state, seconds)
+            advance_route(state, seconds)
 
     def find_place(self) -> PlaceFacts | None:
         """What is known of the panorama that is nearest to the camera; None without any."""

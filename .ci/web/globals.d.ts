@@ -4,7 +4,7 @@ declare const SHADERS: Record<"splat" | "accumulate" | "resolve" | "mark" | "pho
 declare const WORKER: string;
 
 interface Window {
-  addPart(view: number, isLast: boolean): void;
+  addChunk(view: number, isLast: boolean): void;
   addTile(name: string, number: number): void;
   pansplat: EventTarget & Record<string, any>;
 }

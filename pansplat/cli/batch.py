@@ -150,7 +150,7 @@ class Batch(Computation):
         from pansplat.inputs.panorama_sets import PanoramaSet
         from pansplat.system.store import hash_parts
         from pansplat.tours.graph import find_tours
-        from pansplat.tours.merge import describe_tour
+        from pansplat.tours.scene_graph import describe_tour
 
         pairs, found = pipeline.load_sets(folder, **vars(self.reading)), {}
         tours = find_tours(pairs)

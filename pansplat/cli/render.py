@@ -169,15 +169,15 @@ class Render(Computation):
 
     def _list_shots(self, scene: Scene, path: CameraPath | None) -> list[Shot]:
         """The frames of a film: of a path, or of the flight through all input cameras."""
-        from pansplat.export.film import follow_path, list_flight, plan_visits
+        from pansplat.export.film import follow_path, list_frames, plan_visits
         from pansplat.tours.facts import TourFacts
-        from pansplat.tours.merge import make_graph
+        from pansplat.tours.scene_graph import make_graph
 
         if path is not None:
             return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)
         if not len(scene.cam2world):
             raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
-        return list_flight(plan_visits(TourFacts(scene)), self.fps, self.fov, self.seconds)
+        return list_frames(plan_visits(TourFacts(scene)), self.fps, self.fov, self.seconds)
 
     def _make_film(
         self, scene: Scene, source: PanoramaSet | TourGraph | None, options: dict[str, Any], count: int

@@ -33,7 +33,7 @@ from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.refinement.fusion import BACKGROUND_LEVEL, are_seen, measure_reach
-from pansplat.tours.doll_house import Rooms
+from pansplat.tours.houses import Houses
 
 # Lengths are fractions of the height of the cameras over the floor, about 1.5 m.
 _TOP, _DOOR = 0.94, 0.6  # heights of walls and doors over the cameras, as shares of the ceiling's height there
@@ -98,22 +98,22 @@ class DollHouse:
     atlas: bytes
 
 
-def build_panels(rooms: Rooms, is_open: Callable[[int, np.ndarray, float], bool]) -> list[Panel]:
+def build_panels(houses: Houses, is_open: Callable[[int, np.ndarray, float], bool]) -> list[Panel]:
     """The floors, the walls and their tops of all houses.
 
     Args:
-        rooms: all rooms.
+        houses: all houses.
         is_open: whether the cameras of a room see through a wall of it that is on the floor at a height (downwards).
     """
     panels: list[Panel] = []
-    down = rooms.eyes[:, 1]
-    for house, views in enumerate(rooms.houses):
-        shapes = {number: room.shape for number, room in enumerate(rooms.plan.rooms) if room.panoramas[0] in views}
+    down = houses.eyes[:, 1]
+    for house, views in enumerate(houses.views):
+        shapes = {number: room.shape for number, room in enumerate(houses.plan.rooms) if room.panoramas[0] in views}
         chosen = list(views)
-        unit, ceiling = float(np.median(rooms.floors[chosen])), float(np.median(rooms.ceilings[chosen]))
-        eye, floor = float(np.median(down[chosen])), float(np.median((down + rooms.floors)[chosen]))
+        unit, ceiling = float(np.median(houses.floors[chosen])), float(np.median(houses.ceilings[chosen]))
+        eye, floor = float(np.median(down[chosen])), float(np.median((down + houses.floors)[chosen]))
         top, every = eye - _TOP * ceiling, shapely.union_all(list(shapes.values()))
-        doors = [(door.rooms[0], door.ends, eye - _DOOR * ceiling) for door in rooms.plan.doors]
+        doors = [(door.rooms[0], door.ends, eye - _DOOR * ceiling) for door in houses.plan.doors]
         walls = [(room, np.array(wall)) for room, shape in shapes.items() for wall in pairwise(shape.exterior.coords)]
         doors += [(room, wall, top) for room, wall in walls if is_open(room, wall, floor)]
         gaps: list[Gap] = []
@@ -194,21 +194,21 @@ def _raise_walls(
 
 
 @torch.no_grad()
-def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet] = ()) -> DollHouse:
+def make_house(scene: Scene, houses: Houses, photographs: Sequence[PanoramaSet] = ()) -> DollHouse:
     """The doll's houses of a scene.
 
     Args:
         scene: with input cameras.
-        rooms: of the scene.
+        houses: of the scene.
         photographs: of each view; without them the images of the Gaussians.
     """
-    if not rooms.houses:
+    if not houses.views:
         return DollHouse((), (), b"")
-    painter = _Painter(scene, rooms, photographs)
-    panels = build_panels(rooms, painter.is_open)
-    density, places = _pack(panels, _FINEST / float(np.median(rooms.floors)))
+    painter = _Painter(scene, houses, photographs)
+    panels = build_panels(houses, painter.is_open)
+    density, places = _pack(panels, _FINEST / float(np.median(houses.floors)))
     atlas = np.zeros((_ATLAS, _ATLAS, 3), np.uint8)
-    shown = {host: list[np.ndarray]() for host in sorted(set(rooms.hosts))}
+    shown = {host: list[np.ndarray]() for host in sorted(set(houses.hosts))}
     textures = []
     for panel, place in zip(panels, places, strict=True):
         flat = _triangulate(panel.shape)
@@ -216,10 +216,10 @@ def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet] = 
             textures.append((panel, place, *painter.paint(panel, density)))
             uv = (place + _MARGIN + density * flat) / _ATLAS
         else:
-            along = rooms.show(panel.house, np.array(((0.0, 0.0, 0.0), np.insert(panel.facing, 1, 0.0))))
+            along = houses.show(panel.house, np.array(((0.0, 0.0, 0.0), np.insert(panel.facing, 1, 0.0))))
             uv = np.broadcast_to(2 + (along[1] - along[0])[[0, 2]], flat.shape)
-        world = rooms.show(panel.house, panel.locate(flat)) @ rooms.level.T
-        shown[rooms.hosts[panel.house]].append(np.concatenate((world, uv), axis=1))
+        world = houses.show(panel.house, panel.locate(flat)) @ houses.level.T
+        shown[houses.hosts[panel.house]].append(np.concatenate((world, uv), axis=1))
     for panel, place, color, seen in textures:
         beside = [other for other in textures if other[0].room == panel.room and other[0].down[1] == panel.down[1]]
         number = next(number for number, other in enumerate(beside) if other[0] is panel)
@@ -233,16 +233,16 @@ def make_house(scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet] = 
     with io.BytesIO() as file:
         Image.fromarray(atlas).save(file, "WEBP", quality=_QUALITY, method=6)
         corners = tuple(np.concatenate(each) for each in shown.values())
-        return DollHouse(tuple(_list_nodes(rooms, host) for host in shown), corners, file.getvalue())
+        return DollHouse(tuple(_list_nodes(houses, host) for host in shown), corners, file.getvalue())
 
 
-def _list_nodes(rooms: Rooms, host: int) -> dict[int, tuple[float, Float[np.ndarray, "3"]]]:
+def _list_nodes(houses: Houses, host: int) -> dict[int, tuple[float, Float[np.ndarray, "3"]]]:
     """See `DollHouse`."""
     found = {}
-    for house in np.flatnonzero(np.array(rooms.hosts) == host).tolist():
-        for view in rooms.houses[house]:
-            turn = 0.0 if house == host else rooms.plan.drawn[view].turn or 0.0
-            found[view] = turn, rooms.level @ rooms.show(house, rooms.eyes[view])
+    for house in np.flatnonzero(np.array(houses.hosts) == host).tolist():
+        for view in houses.views[house]:
+            turn = 0.0 if house == host else houses.plan.drawn[view].turn or 0.0
+            found[view] = turn, houses.level @ houses.show(house, houses.eyes[view])
     return dict(sorted(found.items()))
 
 
@@ -308,8 +308,8 @@ def _pack(panels: Sequence[Panel], density: float) -> tuple[float, Int[np.ndarra
 class _Painter:
     """Projects photographs on panels."""
 
-    def __init__(self, scene: Scene, rooms: Rooms, photographs: Sequence[PanoramaSet]) -> None:
-        self.rooms, self.poses, self.level = rooms, scene.cam2world.double().cpu(), torch.from_numpy(rooms.level)
+    def __init__(self, scene: Scene, houses: Houses, photographs: Sequence[PanoramaSet]) -> None:
+        self.houses, self.poses, self.level = houses, scene.cam2world.double().cpu(), torch.from_numpy(houses.level)
 
         @functools.lru_cache(maxsize=_KEPT)
         def read(view: int) -> Float[Tensor, "3 height width"]:
@@ -325,11 +325,11 @@ class _Painter:
             if not scene.joint:
                 own &= scene.gaussians.views == view
             self.reaches.append(measure_reach(scene.gaussians.select(own), pose, _REACH_ROWS).cpu())
-        self.eyes = rooms.eyes
+        self.eyes = houses.eyes
 
     def is_open(self, room: int, wall: Float[np.ndarray, "2 2"], floor: float) -> bool:
         """Whether the nearest camera of a room sees through a wall, which is open then, or a window."""
-        views, (start, end) = self.rooms.plan.rooms[room].panoramas, wall
+        views, (start, end) = self.houses.plan.rooms[room].panoramas, wall
         view = min(views, key=lambda view: np.linalg.norm(self.eyes[view][[0, 2]] - (start + end) / 2))
         shares, heights = np.meshgrid(np.linspace(0.1, 0.9, 9), np.linspace(0, 0.8, 5))
         flat = start + shares.reshape(-1, 1) * (end - start)
@@ -341,10 +341,10 @@ class _Painter:
     def paint(self, panel: Panel, density: float) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
         """The texture of a panel, premultiplied, and where it is seen, 0 to 1."""
         width, height = (size - 2 * _MARGIN for size in _measure(panel, density))
-        unit = float(np.median(self.rooms.floors))
+        unit = float(np.median(self.houses.floors))
         coarse = [max(round(size / density / (_STEP * unit)), 1) for size in (width, height)]
         grid = _grid(*coarse, width / density, height / density)
-        costs = np.array([self._judge(panel, grid, view, unit) for view in self.rooms.houses[panel.house]])
+        costs = np.array([self._judge(panel, grid, view, unit) for view in self.houses.views[panel.house]])
         is_seen = np.isfinite(costs)
         shares = is_seen & (costs == costs.min(axis=0))
         wide = np.array([cv2.GaussianBlur(share.astype(np.float32), (0, 0), _WIDE / 2) for share in shares]) * is_seen
@@ -353,7 +353,7 @@ class _Painter:
         shares /= np.maximum(shares.sum(axis=0), 1e-9)
         places = torch.from_numpy(panel.locate(_grid(width, height, width / density, height / density)))
         color = np.zeros((height, width, 3), np.float32)
-        for number, view in enumerate(self.rooms.houses[panel.house]):
+        for number, view in enumerate(self.houses.views[panel.house]):
             if not shares[number].any():
                 continue
             share = cv2.resize(shares[number], (width, height))  # linear
@@ -367,14 +367,14 @@ class _Painter:
         self, panel: Panel, grid: Float[np.ndarray, "h w 2"], view: int, unit: float
     ) -> Float[np.ndarray, "h w"]:
         """How badly a camera shows places of a panel: its distance, more where something is in front; inf if unseen."""
-        room = self.rooms.plan.rooms[panel.room]
+        room = self.houses.plan.rooms[panel.room]
         places, normal = panel.locate(grid), np.cross(panel.down, panel.right)  # into the room
         offsets = places - self.eyes[view]
         distance = np.linalg.norm(offsets, axis=-1)
         world = torch.from_numpy(places.reshape(-1, 3)) @ self.level.T
         is_shown = are_seen(world, self.poses[view], self.reaches[view]).numpy().reshape(distance.shape)
         clear = cv2.GaussianBlur(is_shown.astype(np.float32), (0, 0), _WIDE)
-        house = list(self.rooms.houses[panel.house])
+        house = list(self.houses.views[panel.house])
         aside = np.linalg.norm((places[..., None, :] - self.eyes[house])[..., (0, 2)], axis=-1)
         # Whether each place is on the floor under each camera of the house, where its tripod stands.
         is_under = (aside < _TRIPOD * unit) & (offsets[..., 1:2] > 0.5 * unit)

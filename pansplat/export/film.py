@@ -30,8 +30,9 @@ from pansplat.tours.facts import TourFacts
 from pansplat.tours.graph import Edge, TourGraph
 from pansplat.tours.limits import follow_edge
 from pansplat.tours.links import link_parts
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.merge import select_views
 from pansplat.tours.route import REST_SECONDS, STOP_REACH, Moment, Route, find_offset, plan_route
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.scene_views import choose_scene_views
 from pansplat.tours.walks import plan_walk
 
@@ -143,15 +144,13 @@ class Shot:
 
 def plan_visits(facts: TourFacts) -> Route:
     """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
-    outlooks = dict(enumerate(facts.outlooks))
-    if facts.scene.tour is not None:
-        tour = link_parts(replace(facts.tour, poor=facts.poor))
-        return plan_route(tour, plan_walk(tour), rest=REST_SECONDS, outlooks=outlooks)
-    tour = facts.tour.with_all_edges()
-    return plan_route(tour, range(len(tour)), rest=REST_SECONDS, outlooks=outlooks)
+    is_tour = facts.scene.tour is not None
+    tour = link_parts(facts.graph) if is_tour else facts.bounds
+    walk = plan_walk(tour) if is_tour else range(len(tour))
+    return plan_route(tour, walk, rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
-def list_flight(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
+def list_frames(route: Route, fps: float, vertical_fov_degrees: float, seconds: float | None = None) -> list[Shot]:
     """The frames of a way through panoramas, two or more.
 
     Args:
@@ -212,7 +211,7 @@ class Film:
 
         Args:
             choose: the scene of a frame, and its part of the tour (`choose_scenes`).
-            draw: draws a scene; the number is 0 or 1, and another one for the scene that fades out.
+            draw: draws a scene; the number is slot 0 or 1; the two scenes of a fade have different slots.
             layout: of the frames.
             size: (height, width) of the image of one eye, pixels.
             photographs: that are shown at panoramas.

@@ -59,6 +59,13 @@ class PageNote(_Record):
     addresses: tuple[str, ...]
 
 
+class PageRing(_Record):
+    """A ring to a panorama, and where it is if a link leads there; else it is at the panorama's own mark."""
+
+    node: int
+    mark: Vector | None
+
+
 class PageSpot(_Record):
     """A panorama: its camera, the mark of its ring on the floor, and where there is something to see.
 
@@ -66,7 +73,7 @@ class PageSpot(_Record):
         ahead: yaw and pitch of its start view, else of the widest one, radians.
         has_start: whether it has a start view.
         turns: what a camera that arrives in each direction of the horizon turns by (`find_turns`), radians.
-        hidden: panoramas whose marks surfaces hide.
+        rings: that are offered at it (`choose_rings`).
         clearances: distances of the nearest surfaces around the camera (`measure_clearance`).
     """
 
@@ -77,19 +84,18 @@ class PageSpot(_Record):
     ahead: tuple[float, float]
     has_start: bool
     turns: tuple[float, ...]
-    hidden: tuple[int, ...]
+    rings: tuple[PageRing, ...]
     clearances: tuple[tuple[float, ...], ...]
 
 
 class PageLink(_Record):
-    """A link of the tour and its direction, radians. One to another part, or to a hidden panorama, has a ring."""
+    """A link of the tour and its direction, radians."""
 
     source: int = msgspec.field(name="from")
     target: int = msgspec.field(name="to")
     text: str
     yaw: float
     pitch: float
-    mark: Vector | msgspec.UnsetType = msgspec.UNSET
 
 
 class PagePhotograph(_Record):
@@ -105,7 +111,6 @@ class PagePlan(_Record):
 
     Attributes:
         worlds: of each panorama.
-        rooms: the panoramas of each room.
         drawing: an SVG, base64.
         is_sure: whether the places of all rooms are known; else some are dashed.
         size: its width and height, metres.
@@ -114,7 +119,6 @@ class PagePlan(_Record):
     """
 
     worlds: tuple[int, ...]
-    rooms: tuple[tuple[int, ...], ...]
     drawing: str
     is_sure: bool
     size: tuple[float, float]
@@ -122,8 +126,8 @@ class PagePlan(_Record):
 
 
 class PageHouse(_Record):
-    """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas;
-    of tops of walls 2 + the normal of the wall, to the right and forward. `moves`: what the
+    """A doll's house: its panoramas, and corners of triangles, clockwise in front: x, y, z, and u, v in the atlas.
+    In triangles of wall tops u and v are 2 + the wall's normal (right, forward). `moves`: what the
     surroundings of each panorama are turned by, radians to the right, and where its camera is then."""
 
     nodes: tuple[int, ...]

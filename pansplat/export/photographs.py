@@ -42,7 +42,8 @@ from pansplat.system.progress import report_progress
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.merge import select_views
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.scene_views import choose_scene_views
 
 MIN_HEIGHT = 1024  # least rows of a photograph in a page, unless the file has fewer

@@ -1,7 +1,7 @@
 """Floor plans of straight walls as drawings: SVG, and PNG of the same.
 
-The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed, and beside
-them. They are 1:50 on paper.
+The longest wall is horizontal. Storeys are in rows, the lowest first. Rooms that are not placed are dashed
+and stand beside the others. Drawings are 1:50.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import describe_count
 from pansplat.system.files import SOFTWARE
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import list_pieces
+from pansplat.tours.floor import list_storeys_of_worlds
 from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.linked_rooms import turn_plan
 from pansplat.tours.plan import Plan, Room
@@ -184,7 +184,7 @@ class _Drawing:
     @cached_property
     def _pieces(self) -> list[tuple[int, int]]:
         """World and storey in which each panorama is drawn."""
-        pieces = list_pieces(self.plan.tour)
+        pieces = list_storeys_of_worlds(self.plan.tour)
         drawn = self.plan.drawn
         return [pieces[drawn[node].beside] if node in drawn else piece for node, piece in enumerate(pieces)]
 

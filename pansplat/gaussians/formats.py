@@ -34,7 +34,7 @@ from pansplat.gaussians.scene_files import (
     find_label_runs,
     format_entry,
     limit_degree,
-    make_scene,
+    restore_scene,
     select_finite,
     sort_by_label,
 )
@@ -164,7 +164,7 @@ def _load_coded(path: Path, coded: _Coded) -> Scene:
         raise InputError(f"{path}: needed a .{coded.name} scene, got a file that starts with {content[:8]!r}; check it")
     gaussians, _ = read_ply(io.BytesIO(_decode(content, path, coded)), path)
     entry = None if coded.find_entry is None else coded.find_entry(content)
-    return make_scene(gaussians.rotated(Y_UP) if coded.y_up else gaussians, entry, path)
+    return restore_scene(gaussians.rotated(Y_UP) if coded.y_up else gaussians, entry, path)
 
 
 def _encode(gaussians: Gaussians, path: Path, coded: _Coded) -> bytes:

@@ -31,7 +31,7 @@ from pansplat.gaussians.scene_files import (
     find_label_runs,
     format_entry,
     limit_degree,
-    make_scene,
+    restore_scene,
     select_finite,
     sort_by_label,
 )
@@ -154,7 +154,7 @@ def load_glb(path: Path) -> Scene:
         raise InputError(f"{path}: needed Gaussians of one degree of harmonics, got several; export it again")
     extras = read_field(read_field(document, "asset", _Object, path, {}), "extras", _Object, path, {}).get("pansplat")
     entry = None if extras is None else json.dumps(extras)
-    return make_scene(Gaussians.cat(parts).rotated(Y_UP), entry, path)
+    return restore_scene(Gaussians.cat(parts).rotated(Y_UP), entry, path)
 
 
 def _read_chunks(content: bytes, path: Path) -> tuple[dict[str, Any], bytes]:

@@ -35,7 +35,7 @@ from pansplat.gaussians.scene_files import (
     find_label_runs,
     finite_mask,
     format_entry,
-    make_scene,
+    restore_scene,
     select_finite,
     sort_by_label,
 )
@@ -176,7 +176,7 @@ def load_ply(path: str | Path) -> Scene:
             gaussians, comments = read_ply(file, path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    return make_scene(gaussians, find_entry(comments), path)
+    return restore_scene(gaussians, find_entry(comments), path)
 
 
 def read_ply(file: BufferedIOBase, path: Path) -> tuple[Gaussians, list[str]]:

@@ -69,7 +69,7 @@ def _escape(text: str) -> str:
     return text.encode(errors="backslashreplace").decode()
 
 
-def make_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
+def restore_scene(gaussians: Gaussians, entry: str | None, path: Path) -> Scene:
     """The scene of a file, in a unit near metres.
 
     Without an entry the scene has no cameras, and all Gaussians are at level 0 of view 0. A damaged entry is ignored

@@ -224,7 +224,7 @@ def _check_inputs(
         require_working_world(cam2world, low, high)
 
 
-def load_predictor(
+def load_network_predictor(
     path: str | Path,
     compat: CompatChoice = "trained",
     *,
@@ -292,7 +292,7 @@ def build_network(weights: WeightsFile, compat: Compat, source: object, **choice
     """Build the network of a weights file, in eval mode.
 
     Args:
-        choices: `precision` and `attention_precision`, as in `load_predictor`.
+        choices: `precision` and `attention_precision`, as in `load_network_predictor`.
     """
     network = build_empty_network(weights, compat, source, **choices)
     require_shapes(weights.tensors, network.state_dict(), source)

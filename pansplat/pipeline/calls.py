@@ -62,8 +62,8 @@ def predict(
         compat, precision, depth_network: see `load_model`; without effect on a predictor object.
         height: panoramas are resized to (height, 2 height); by default that of the photographs, at most the largest
             default of the predictor, of a tour 512. Loaded panoramas keep their size.
-        refine_steps: of the refinement. By default 0, for none; that of `PredictOptions` is None, which is
-            `choose_refine_steps`, and 0 for networks. A single view is not refined.
+        refine_steps: of the refinement. 0 for none (the default here); None: `choose_refine_steps`, 0 for networks. A
+            single view is not refined.
         gaussians: largest number after a refinement; similar neighbours are merged before it. In a tour each panorama
             has an equal part of it; without a refinement the scene may have more.
         joint: whether each surface is kept once, for programs that draw all Gaussians together (`fuse_views`). Without

@@ -20,7 +20,7 @@ from pansplat.rendering import Rendering, rasterize
 from pansplat.rendering import blend as blend_renderings
 from pansplat.rendering.official import rasterize_official
 from pansplat.system.devices import choose_device, note_full_card
-from pansplat.tours.merge import make_graph
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.scene_views import choose_scene_views
 
 Drawing = Literal["exact", "original"]
@@ -47,10 +47,9 @@ def render(
         cam2world: pose of the camera, OpenCV axes, in the world of `scene.cam2world`; `scene.frame.localize` brings a
             pose of the user's world there.
         blend: "deferred" renders the Gaussians of each context view and blends the images by nearness; in a scene of
-            a tour, those of the views at the nearest edge. Views without weight are rendered only where these leave
-            holes, which they fill, of a tour those of the part. "joint"
-            renders all Gaussians together, of a tour those of the part; a number renders those of one view only. By
-            default as the scene is made for (`Scene.joint`).
+            a tour, those of the views at the nearest edge. The other views (of a tour: of the same part) are rendered
+            only if these leave holes. "joint" renders all Gaussians together, of a tour those of the part; a number
+            renders those of one view only. By default as the scene is made for (`Scene.joint`).
         size: (height, width), pixels; by default the scene's height, 2:1 (16:9 for `pinhole`).
         layout: "equirect", "cubemap" or "pinhole".
         eye_distance: if given, omni-directional stereo (docs/rendering.md, section 9): the left eye's panorama above

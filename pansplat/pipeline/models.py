@@ -38,7 +38,7 @@ def load_model(
         depth_network: for "default" and files of depth networks: an ONNX file of relative depth, whose edges the
             surfaces have (docs/depth_network.md).
         **options: of "sweep", the arguments of `pansplat.sweep.Sweep`; of the weights of a network, those of
-            `pansplat.model.network.load_predictor`; others have none.
+            `pansplat.model.network.load_network_predictor`; others have none.
         device: see `predict`.
     """
     if compat not in get_args(CompatChoice):
@@ -53,9 +53,9 @@ def load_model(
     if depth_network is not None and not is_guided:
         raise InputError(f"`depth_network` is for the model default, got the model {name}; leave one of them out")
     if path is not None and not is_guided:
-        from pansplat.model.network import load_predictor
+        from pansplat.model.network import load_network_predictor
 
-        return load_predictor(path, compat, precision=precision, **options)
+        return load_network_predictor(path, compat, precision=precision, **options)
     refused = {"compat": compat != "trained", "precision": precision != "float32"}
     refused |= dict.fromkeys(options, str(name) != "sweep")
     for option, is_refused in refused.items():

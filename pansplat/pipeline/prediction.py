@@ -30,7 +30,7 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.devices import choose_device, note_full_card, with_device
 from pansplat.system.options import CAMERA_HEIGHT, MIN_HEIGHT
 from pansplat.system.progress import report_progress, stage
-from pansplat.tours.merge import list_starts
+from pansplat.tours.scene_graph import list_starts
 
 _DEFAULT_HEIGHT = 512  # rows of the panoramas that networks predict from; larger ones take minutes
 _REFINE_STEPS = 40  # default steps of layers; more change little (docs/refinement.md)

@@ -1,4 +1,4 @@
-"""Two contents of a picture, one of which fades out."""
+"""A cross-fade between two pictures (scenes or photographs)."""
 
 from __future__ import annotations
 

@@ -18,9 +18,9 @@ from pansplat.system.store import Store, hash_parts
 from pansplat.tours.edges import find_poor_edges, find_walls
 from pansplat.tours.floor import FloorOutline, choose_camera_height, find_ceiling, find_floor, find_floor_outline
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
-from pansplat.tours.merge import describe_tour, make_graph
 from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
 from pansplat.tours.plan import Door, Plan, Room, make_plan
+from pansplat.tours.scene_graph import describe_tour, make_graph
 from pansplat.tours.surfaces import Surfaces, find_surfaces
 
 Value = TypeVar("Value")
@@ -42,7 +42,7 @@ class TourFacts:
 
     Attributes:
         scene: of some panoramas of the tour, in its world, with all Gaussians of each.
-        tour: the graph.
+        tour: the graph, before its surfaces are known.
         views: the number in the tour of each of the scene's views.
     """
 
@@ -69,7 +69,7 @@ class TourFacts:
 
     def prepare(self) -> TourFacts:
         """Compute what a viewer reads while it draws."""
-        _ = self.outlines, self.outlooks, self.clearances, self.hidden, self.walls, self.poor
+        _ = self.outlines, self.outlooks, self.hidden, self.graph
         return self.forget_surfaces()
 
     def forget_surfaces(self) -> TourFacts:
@@ -134,10 +134,17 @@ class TourFacts:
         return np.stack([measure_clearance(own) for own in self.surfaces.values()])
 
     @cached_property
+    def graph(self) -> TourGraph:
+        """The tour with what its surfaces show: walls in place of edges, poor edges, and clearances."""
+        tour = self.tour.with_walls(self.walls) if self.walls else self.tour
+        clearances = dict(zip(self.views, self.clearances, strict=True))
+        poor = tuple(edge for edge in self.poor if edge in tour.overlaps)
+        return dataclasses.replace(tour, poor=poor, clearances=clearances)
+
+    @property
     def bounds(self) -> TourGraph:
         """The graph of a scene without edges, whose surfaces stop cameras."""
-        clearances = dict(zip(self.views, self.clearances, strict=True))
-        return dataclasses.replace(self.tour.with_all_edges(), clearances=clearances)
+        return self.graph.with_all_edges()
 
     @_stored
     def hidden(self) -> list[list[int]]:
@@ -151,7 +158,7 @@ class TourFacts:
 
     @_stored
     def walls(self) -> list[Edge]:
-        """The edges that the scene shows to be none (`find_walls`); a scene of `merge_scenes` has no others."""
+        """Edges through walls. Empty if `scene.tour` is known: `merge_scenes` has removed them."""
         return [] if self.scene.tour else find_walls(self.surfaces, self.tour.overlaps)
 
     @_stored

@@ -15,7 +15,7 @@ from shapely.geometry import Polygon
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.surfaces import Surfaces, split_by_azimuth
 
-_CAMERA_HEIGHT = 0.15  # height of a camera over a floor that is not seen, as a fraction of far
+_UNSEEN_FLOOR = 0.15  # height of a camera over a floor that is not seen, as a fraction of far
 _AZIMUTHS = 180  # number of corners of a floor outline
 _NECK = 0.3  # half the width of a door, in heights of the camera; floors end where they are narrower
 _LEAST_FULL = 0.65  # least part of its convex hull that a floor fills; rays through wide openings fill 0.5 to 0.64
@@ -43,7 +43,7 @@ def choose_camera_height(heights: Iterable[float | None], far: float) -> float:
         far: of the scene or tour, metres.
     """
     known = [height for height in heights if height is not None]
-    return float(np.median(known)) if known else _CAMERA_HEIGHT * far
+    return float(np.median(known)) if known else _UNSEEN_FLOOR * far
 
 
 def find_ceiling(places: Float[np.ndarray, "n 3"]) -> float | None:
@@ -174,6 +174,6 @@ def assign_storeys(tour: TourGraph) -> list[int]:
     return storeys.tolist()
 
 
-def list_pieces(tour: TourGraph) -> list[tuple[int, int]]:
-    """The world of each panorama, and its storey there: those of a piece are drawn together."""
+def list_storeys_of_worlds(tour: TourGraph) -> list[tuple[int, int]]:
+    """The world of each panorama, and its storey there: those of one storey are drawn together."""
     return list(zip(tour.worlds, assign_storeys(tour), strict=True))

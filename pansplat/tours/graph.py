@@ -35,8 +35,8 @@ _MIN_PANORAMAS = 3  # least number of panoramas of a tour of one part
 class TourGraph:
     """Panoramas of one place and the edges between them.
 
-    Panoramas that edges connect are a part. Within a part the camera flies; from part to part it zooms. Parts
-    without a common world are side by side (`lay_out`).
+    Panoramas that edges connect are a part. A camera flies along edges, and zooms along poor edges and between parts.
+    Parts without a common world are side by side (`lay_out`).
 
     Attributes:
         name: for lists and folders.
@@ -100,7 +100,10 @@ class TourGraph:
 
     @cached_property
     def worlds(self) -> tuple[int, ...]:
-        """The world of each node: parts with walls between them have known relative places. A pair has no edges."""
+        """The world of each node: parts with walls between them have known relative places.
+
+        Without edges (a scene that is no tour): the worlds of the files.
+        """
         if not self.overlaps:
             return tuple(panorama.world for panorama in self.panoramas)
         return tuple(label_components(len(self), [*self.overlaps, *self.walls]))
@@ -111,7 +114,7 @@ class TourGraph:
 
     @cached_property
     def approximate(self) -> dict[int, tuple[int, ApproximatePlace]]:
-        """The nodes that are not placed, but about a node beside them, and where, as the files of the tour state it."""
+        """For each node that is not placed: the node beside which the files put it, and where."""
         number = {view.image: node for node, view in enumerate(self.panoramas) if view.placement.about is None}
         stated = ((node, view.placement.about) for node, view in enumerate(self.panoramas) if not self.is_placed(node))
         return {node: (number[about.beside], about) for node, about in stated if about and about.beside in number}

@@ -1,4 +1,4 @@
-"""Worlds of a tour in one: level, side by side, so far apart that the nearest edge is in the camera's world."""
+"""Puts the worlds of a tour side by side in one, far enough apart that the nearest edge is of the camera's world."""
 
 from __future__ import annotations
 

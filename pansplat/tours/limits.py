@@ -29,7 +29,7 @@ def follow_edge(tour: TourGraph, position: Float[np.ndarray, "3"], current: Edge
 
 
 def limit_step(tour: TourGraph, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Where a step of a camera that walks ends: before surfaces, and near a poor edge not between its panoramas."""
+    """Where the step of a walk ends: it stops before surfaces, and along a poor edge near either panorama."""
     edge, _ = tour.find_nearest_edge(end)
     if edge in tour.poor:
         end = _limit_along(tour, edge, start, end)
@@ -44,7 +44,7 @@ def _measure_free(tour: TourGraph, edge: Edge, place: Float[np.ndarray, "3"]) ->
     """How far a camera near an edge may go on, metres, negative too near a surface; and the direction from the
     panorama that sees it free.
 
-    Beside a panorama, and beside a line along which cameras fly, it is free.
+    Within `CLEARANCE` of a panorama or of a flown edge surfaces are ignored.
     """
     found = []
     for node in [node for node in edge if node in tour.clearances]:

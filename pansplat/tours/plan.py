@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from shapely.geometry import Polygon
 
 from pansplat.system.components import label_components
-from pansplat.tours.floor import FloorOutline, choose_camera_height, list_pieces
+from pansplat.tours.floor import FloorOutline, choose_camera_height, list_storeys_of_worlds
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
 from pansplat.tours.surfaces import RAY_ANGLES, RAY_DIRECTIONS, RAYS, Outline, Surfaces, meet_outline, split_by_azimuth
@@ -195,7 +195,7 @@ def make_plan(
     count, unit = len(tour), choose_camera_height(heights, tour.far)
     seen = zip(surfaces, heights, ceilings, floors, strict=True)
     sights = [_look(own, height or unit, ceiling, floor) for own, height, ceiling, floor in seen]
-    pieces, worlds = list_pieces(tour), tour.worlds
+    pieces, worlds = list_storeys_of_worlds(tour), tour.worlds
     rooms: list[Room] = []
     for piece in sorted({*pieces}):
         world, storey = piece

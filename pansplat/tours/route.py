@@ -43,8 +43,8 @@ class Step:
     """A movement of the camera, which starts and stops smoothly.
 
     Attributes:
-        start, end: right, down and forward in metres, yaw and pitch in radians, relative to the route's `level`. A
-            camera that zooms stands at the start, and is at the end afterwards.
+        start, end: right, down and forward in metres, yaw and pitch in radians, relative to the route's `level`. In
+            a zoom the camera stays at `start` and jumps to `end`.
         edge: whose scene is shown; None is that of the camera's place.
         nodes: the panoramas at both ends; None elsewhere.
         following: index in the walk of the next panorama.

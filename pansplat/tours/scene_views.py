@@ -1,4 +1,4 @@
-"""Which panoramas the scene of an edge, a scene of all panoramas and a prediction are of."""
+"""Chooses the panoramas of the scene of an edge, of the whole scene, and of each prediction."""
 
 from __future__ import annotations
 

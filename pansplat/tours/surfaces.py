@@ -56,7 +56,7 @@ class Surfaces:
 
     @cached_property
     def samples(self) -> Float[np.ndarray, "k 3"]:
-        """The places, of each of many equal solid angles the one of median distance.
+        """One place for each cell of equal solid angle: that of median distance.
 
         Pictures of much detail have more Gaussians: where they are and how many has no influence on what is measured
         here.

@@ -1,1 +1,1 @@
-"""Styles and scripts of web pages, which `pansplat.export.page` joins to one file or a folder. docs/web.md."""
+"""Styles and scripts of web pages, which `pansplat.export.page_program` joins to one file or a folder. docs/web.md."""

@@ -29,9 +29,8 @@ export function turn(yaw, pitch) {
   changed();
 }
 
-// Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part, or
-// near the panoramas of a scene without edges; steps away from them become shorter near the limit. Nothing walks along poor
-// edges, or into surfaces.
+// Moves along the camera's heading: right, up and forward in metres. The camera stays near the edges of its part;
+// steps away from them become shorter near the limit. Nothing walks along poor edges, or into surfaces.
 export function walk(right, up, forward) {
   const limit = HEADER.limits[currentPart()];
   if (state.doll.isOn || !state.sorted || !limit) return;
@@ -39,7 +38,7 @@ export function walk(right, up, forward) {
   const local = [cy * right + sy * forward, -up, -sy * right + cy * forward];
   const step = plus(camera.position, fromAxes(HEADER.level, local));
   const target = limitStep(GRAPH, camera.position, step, currentPart());
-  const from = edges.length ? closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target) : findSpot(target).position;
+  const from = closestOnEdge(GRAPH, nearestEdge(GRAPH, target, currentPart()), target);
   const before = distanceOf(camera.position, from), after = distanceOf(target, from);
   const outward = Math.max(after - before, 0), slower = clamp((1 - before / limit) / SOFT, 0, 1);
   const allowed = Math.min(after - (1 - slower) * outward, limit);
@@ -55,7 +54,7 @@ export const nearestNode = (position) => nearestOf([...parts.keys()].filter((nod
 // Whether the camera is where there are photographs and no Gaussians; it stays at them.
 export const isFixed = () => HEADER.limits[currentPart()] === 0;
 
-// The panorama at the camera, or that from which it looked at the doll's house.
+// The panorama at the camera; in the doll's house, the panorama that the camera left.
 export const nodeHere = () => state.doll.isOn ? state.doll.node : nearestNode(camera.position);
 
 // The panorama within a distance of the camera, metres; null without one, and in the doll's house.
@@ -74,10 +73,8 @@ export function cameraFor({ position, yaw, pitch, fov }) {
   };
   if (position !== undefined) {
     check("position", [0, 1, 2].map((k) => position[k]));
-    const near = edges.length ? nearestEdge(GRAPH, position) : null;
-    const limit = HEADER.limits[near === null ? 0 : partOfEdge(GRAPH, near)];
-    const closest = near !== null && closestOnEdge(GRAPH, near, position), ends = near !== null && edges[near].slice(0, 2);
-    const from = near === null ? findSpot(position).position : limit ? closest : GRAPH.positions[nearestOf(ends, closest)];
+    const near = nearestEdge(GRAPH, position), closest = closestOnEdge(GRAPH, near, position), limit = HEADER.limits[partOfEdge(GRAPH, near)];
+    const from = limit ? closest : GRAPH.positions[nearestOf(edges[near].slice(0, 2), closest)];
     const away = distanceOf(position, from);
     found.position = plus(from, scaled(minus(position, from), Math.min(limit / Math.max(away, 1e-9), 1)));
   }
@@ -92,7 +89,6 @@ export const findSpot = (position) => HEADER.spots[nearestNode(position)];
 
 // The place of the floor below a position: along an edge, between those of its panoramas.
 export function floorPoint(position) {
-  if (!edges.length) return findSpot(position).mark;
   const [from, to] = endsOfEdge(), [start, end] = [from, to].map((node) => GRAPH.positions[node]);
   const part = distanceOf(closestOnEdge(GRAPH, state.edge, position), start) / Math.max(distanceOf(start, end), 1e-6);
   return plus(HEADER.spots[from].mark, scaled(minus(HEADER.spots[to].mark, HEADER.spots[from].mark), part));
@@ -155,6 +151,4 @@ function settle(number) {
   Object.assign(state, { edge: number, group: edges[number][2], fade: null });
 }
 
-export function settleAt(position) {
-  if (edges.length) settle(nearestEdge(GRAPH, position));
-}
+export const settleAt = (position) => settle(nearestEdge(GRAPH, position));

@@ -1,37 +1,9 @@
-// What is offered at a panorama, and where a way ends there: functions of HEADER, which need no browser.
+// Where ways lead and end, and what boxes cover: functions of HEADER, which need no browser.
 
-import { distanceOf, findBin, inAxes, minus } from "./graph.js";
-import { edges, GRAPH, parts } from "./state.js";
+import { findBin, inAxes, minus } from "./graph.js";
+import { GRAPH } from "./state.js";
 
 const LEVEL_WAY = 0.1; // metres to the side, from which on a way has a heading
-
-const isFlown = (from, to) => {
-  return edges.length ? edges.some(([a, b]) => (a === from && b === to) || (a === to && b === from)) : parts[from] === parts[to];
-};
-
-// The rings of a panorama, `{ node, link }`: those of its photograph's links, on the floor where the link meets it or where the
-// other camera stands; those where its flights end, unless a surface hides them; and its own. Of another room only one.
-// Where all flights are hidden, the nearest one stays; where nothing leads on, what leads here, or the nearest panorama.
-export function chooseRings(here) {
-  const { rooms } = HEADER.plan, { hidden } = HEADER.spots[here];
-  const roomOf = (node) => rooms.findIndex((nodes) => nodes.includes(node));
-  const away = (node) => distanceOf(GRAPH.positions[node], GRAPH.positions[here]);
-  const all = HEADER.links, links = all.filter(({ from }) => from === here), linked = links.map(({ to }) => to);
-  const others = [...parts.keys()].filter((node) => node !== here).sort((a, b) => away(a) - away(b));
-  const flown = others.filter((node) => isFlown(here, node) && !linked.includes(node));
-  const seen = flown.filter((node) => !hidden.includes(node));
-  const offered = [
-    ...links.filter((link) => link.mark || parts[link.to] === parts[here]).map((link) => ({ node: link.to, link: link.mark ? link : null })),
-    ...(seen.length || links.length ? seen : flown.slice(0, 1)).map((node) => ({ node, link: null })),
-  ];
-  if (!offered.length) offered.push(...all.filter(({ to }) => to === here).map(({ from }) => ({ node: from, link: null })));
-  if (!offered.length) offered.push(...others.slice(0, 1).map((node) => ({ node, link: null })));
-  const first = offered.filter(({ node }, k) => {
-    const room = roomOf(node), isBefore = (other) => other.node === node || room >= 0 && roomOf(other.node) === room;
-    return room >= 0 && room === roomOf(here) || !offered.slice(0, k).some(isBefore);
-  });
-  return [...first, { node: here, link: null }];
-}
 
 export const findLink = (from, to) => HEADER.links.find((link) => link.from === from && link.to === to);
 
@@ -50,7 +22,8 @@ export function findHeading(from, to) {
 }
 
 // Yaw and pitch at the end of a way with a heading: the start view of the panorama, else the heading, or the widest view where no
-// heading is known. What is no flight comes away from the link back. Without a start view, it turns from a wall that is close.
+// heading is known. After a zoom the camera looks away from the link that leads back. Without a start view, it turns from a wall
+// that is close.
 export function chooseArrival(node, heading, from = null) {
   const { ahead: [yaw, pitch], hasStart, turns } = HEADER.spots[node], back = from !== null && findLink(node, from);
   if (!back && (hasStart || !heading)) return { yaw, pitch };

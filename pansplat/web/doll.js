@@ -45,7 +45,7 @@ function frame([width, height]) {
   return [[left, 1, tall * width / height], [top, 1 - 2 * BUTTON_ROW / height, tall]];
 }
 
-// The distance from which places around the middle are in what is free.
+// The least distance at which all places are in the free area of the window.
 function fit(offsets, yaw, pitch, size) {
   const rotation = turned(yaw, pitch), sides = frame(size);
   const needed = offsets.map((offset) => {

@@ -1,4 +1,5 @@
-// The page in other pages and for scripts (docs/web.md, Embedding): arrivals, and whose the wheel is.
+// The page in other pages and for scripts (docs/web.md, Embedding): events of arrival, and whether the wheel scrolls the host
+// page.
 
 class Embed {
   constructor() {

@@ -1,22 +1,22 @@
-// Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump fades:
-// the image of the camera before covers the new one until that is there, then it fades out; that of a zoom grows.
+// Ways of the camera that need no hand: flights along edges, zooms elsewhere, and jumps. docs/web.md describes them. A jump shows a
+// still of the old picture until the new one is ready, then fades it out; in a zoom the still grows.
 
 import { cameraFor, isFixed, nearestNode, nodeHere, nodeWithin, settleAt, turn } from "./camera.js";
 import { chooseArrival, findHeading, headingTo } from "./choices.js";
 import { findHouse, frameDoll, isInDoll, nearestInDoll, orbit, placeInDoll } from "./doll.js";
 import { byId, calm, canvas, fullSize, say } from "./dom.js";
-import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isFade, minus, nearestEdge, partOfEdge, plus, scaled, wrapAngle } from "./graph.js";
+import { clamp, DEGREE, distanceOf, ease, findWay, followEdge, isZoom, minus, nearestEdge, partOfEdge, plus, scaled, wrapAngle } from "./graph.js";
 import { photographs } from "./photographs.js";
 import { drawAt, measureAt, rayOf } from "./picture.js";
-import { camera, changed, currentPart, edges, GRAPH, isComplete, makeStart, state } from "./state.js";
+import { camera, changed, currentPart, GRAPH, isComplete, makeStart, state } from "./state.js";
 
 const DOLL_SECONDS = 1.6; // duration of a flight out of the rooms, or into one
 const MAX_STILL = 8e6; // pixels of the image of a still, whose memory it limits
 const NEAR = HEADER.speed; // metres: a second's walk
 export const PHOTO_WAIT_MS = 2000; // longest wait for a photograph: at the end of a zoom, and before the first Gaussians are loaded
 
-function jump(position, { yaw, pitch }, isZoom = false) {
-  takeStill(isZoom);
+function jump(position, { yaw, pitch }, grows = false) {
+  takeStill(grows);
   place({ position: [...position], yaw, pitch });
 }
 
@@ -104,23 +104,23 @@ function flyDoll(target, then = () => orbit(0, 0)) {
 
 export function advanceDollFlight(now) {
   if (state.doll.isDue && canShowDoll()) enterDoll();
-  const way = state.doll.flight;
-  if (!way || isWaiting()) return;
-  way.began ??= now;
-  const t = way.seconds ? clamp((now - way.began) / (1000 * way.seconds), 0, 1) : 1, part = ease(t);
+  const { flight } = state.doll;
+  if (!flight || isWaiting()) return;
+  flight.began ??= now;
+  const t = flight.seconds ? clamp((now - flight.began) / (1000 * flight.seconds), 0, 1) : 1, part = ease(t);
   const mix = (from, to) => from + part * (to - from);
-  camera.position = way.start.position.map((from, k) => mix(from, way.target.position[k]));
-  for (const name of ["yaw", "pitch", "fov"]) camera[name] = mix(way.start[name], way.target[name]);
+  camera.position = flight.start.position.map((from, k) => mix(from, flight.target.position[k]));
+  for (const name of ["yaw", "pitch", "fov"]) camera[name] = mix(flight.start[name], flight.target[name]);
   changed();
   if (t < 1) return;
   state.doll.flight = null;
-  way.then();
+  flight.then();
 }
 
 // ---- flights and jumps ----
 
 // The camera goes to a panorama along the edges. On each step it turns to the way, then it flies, looking ahead, or the image
-// grows and fades. A leg has what changes: a `view` to turn to, a `path` of two places, or a `view` after a fade to the
+// grows and fades. A leg has what changes: a `view` to turn to, a `path` of two places, or a `view` after a zoom to the
 // panorama `to`.
 export function flyTo(spot) {
   if (state.doll.isOn) {
@@ -128,57 +128,56 @@ export function flyTo(spot) {
     return;
   }
   const { legs, end } = planWay(spot);
-  state.flight = { spot, legs: calm.matches ? [{ to: spot, view: end }] : legs, began: null };
-  if (state.isTouring) state.flight.legs.push({ rest: HEADER.restSeconds });
+  state.way = { spot, legs: calm.matches ? [{ to: spot, view: end }] : legs, began: null };
+  if (state.isTouring) state.way.legs.push({ rest: HEADER.restSeconds });
   changed();
 }
 
 // The legs of a way, and yaw and pitch at its end.
 function planWay(spot) {
-  const part = edges.length ? partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)) : 0;
-  const way = edges.length ? findWay(GRAPH, camera.position, spot, part) : [spot];
+  const walk = findWay(GRAPH, camera.position, spot, partOfEdge(GRAPH, followEdge(GRAPH, camera.position, state.edge)));
   const here = nodeHere(), ahead = { yaw: camera.yaw, pitch: camera.pitch }, legs = [];
   let from = nodeWithin(HEADER.stopReach), position = [...camera.position], heading = ahead, end = chooseArrival(spot, ahead);
-  way.forEach((node, i) => {
-    const before = i > 0 ? way[i - 1] : null, isZoom = before !== null && isFade(GRAPH, before, node);
-    const isLeft = i === 0 && node === here && isFade(GRAPH, node, way[1] ?? node); // a zoom begins where the camera is
+  walk.forEach((node, i) => {
+    const before = i > 0 ? walk[i - 1] : null, zooms = before !== null && isZoom(GRAPH, before, node);
+    const isLeft = i === 0 && node === here && isZoom(GRAPH, node, walk[1] ?? node); // a zoom begins where the camera is
     if (node === from || isLeft) return;
-    heading = isZoom ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || ahead;
+    heading = zooms ? findHeading(before, node) : headingTo(GRAPH.positions[node], position) || ahead;
     if (heading) legs.push({ view: heading });
-    end = chooseArrival(node, heading, isZoom ? before : null);
-    legs.push(isZoom ? { to: node, view: end } : { from, to: node, path: [position, GRAPH.positions[node]] });
+    end = chooseArrival(node, heading, zooms ? before : null);
+    legs.push(zooms ? { to: node, view: end } : { from, to: node, path: [position, GRAPH.positions[node]] });
     [from, position] = [node, GRAPH.positions[node]];
   });
   if (!legs.length || legs.at(-1).path && (HEADER.spots[spot].hasStart || end.yaw !== heading.yaw)) legs.push({ view: end });
   return { legs, end };
 }
 
-export function advanceFlight(now) {
-  const { flight } = state;
-  if (!flight || isWaiting() || state.still?.isZoom) return;
-  const [leg] = flight.legs;
-  if (flight.began === null) beginLeg(leg, now);
-  const t = leg.seconds ? clamp((now - flight.began) / (1000 * leg.seconds), 0, 1) : 1, step = ease(t) - leg.done;
+export function advanceWay(now) {
+  const { way } = state;
+  if (!way || isWaiting() || state.still?.isZoom) return;
+  const [leg] = way.legs;
+  if (way.began === null) beginLeg(leg, now);
+  const t = leg.seconds ? clamp((now - way.began) / (1000 * leg.seconds), 0, 1) : 1, step = ease(t) - leg.done;
   leg.done = ease(t);
   if (leg.turn) turn(leg.turn[0] * step, leg.turn[1] * step); // a drag adds to it
   if (leg.path) camera.position = t < 1 ? plus(leg.path[0], scaled(minus(leg.path[1], leg.path[0]), leg.done)) : [...leg.path[1]];
   if (leg.path) changed();
   if (t < 1) return;
   if (leg.to !== undefined && !leg.path) jump(GRAPH.positions[leg.to], leg.view, !calm.matches);
-  flight.began = null;
-  flight.legs.shift();
-  if (flight.legs.length) {
-    if (!leg.seconds && leg.to === undefined) advanceFlight(now); // a zoom begins with the picture at rest, which has the full resolution
+  way.began = null;
+  way.legs.shift();
+  if (way.legs.length) {
+    if (!leg.seconds && leg.to === undefined) advanceWay(now); // a zoom begins with the picture at rest, which has the full resolution
     return;
   }
-  state.flight = null;
-  if (state.isTouring) flyTo(nextOnTour(flight.spot));
+  state.way = null;
+  if (state.isTouring) flyTo(nextOnTour(way.spot));
 }
 
 const nextOnTour = (node) => HEADER.walk[(HEADER.walk.indexOf(node) + 1) % HEADER.walk.length];
 
 function beginLeg(leg, now) {
-  state.flight.began = now;
+  state.way.began = now;
   leg.done = 0;
   leg.seconds = leg.rest || 0;
   const [least, most] = HEADER.flightSeconds;
@@ -195,8 +194,8 @@ export function setTouring(value) {
   if (state.isTouring && state.doll.isOn) jump(GRAPH.positions[state.doll.node], state.doll.heading);
   byId("play").setAttribute("aria-pressed", state.isTouring);
   byId("play").querySelector("path").setAttribute("d", state.isTouring ? "M7 5h4v14H7zM13 5h4v14h-4z" : "M8 5v14l11-7z");
-  if (!state.isTouring) state.flight = null;
-  else if (!state.flight) flyTo(nextOnTour(nodeHere()));
+  if (!state.isTouring) state.way = null;
+  else if (!state.way) flyTo(nextOnTour(nodeHere()));
   changed();
 }
 
@@ -208,7 +207,7 @@ export function goHome() {
 // Goes to another camera; the image fades, unless the order of the Gaussians is right there too.
 function goToPose(pose) {
   const isFar = distanceOf(pose.position, camera.position) > NEAR;
-  const isElsewhere = edges.length && partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
+  const isElsewhere = partOfEdge(GRAPH, nearestEdge(GRAPH, pose.position)) !== currentPart();
   if (isFar || isElsewhere || state.headset.session) takeStill();
   place(pose);
 }
@@ -225,20 +224,20 @@ export function jumpTo(node) {
   jump(GRAPH.positions[node], state.doll.isOn ? chooseArrival(node, null) : planWay(node).end);
 }
 
-export const isFlying = () => state.flight !== null;
+export const isOnWay = () => state.way !== null;
 
 // The still, the image of the last camera before a jump, covers the new one until that is sorted, then it fades out.
 const stillCanvas = byId("still");
 
 // Takes the still from the picture; for a zoom it is large enough to grow.
-function takeStill(isZoom = false) {
+function takeStill(grows = false) {
   if (!state.renderer || !state.sorted) return;
-  const zoom = isZoom ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * HEADER.zoom * camera.fov * DEGREE) : 1;
-  state.still = { taken: null, began: null, left: 1, position: null, isZoom, zoom };
+  const zoom = grows ? Math.tan(0.5 * camera.fov * DEGREE) / Math.tan(0.5 * HEADER.zoom * camera.fov * DEGREE) : 1;
+  state.still = { taken: null, began: null, left: 1, position: null, isZoom: grows, zoom };
   if (state.headset.session) return; // it fades from black
   const full = fullSize(), larger = photographs.isOpaque ? Math.max(Math.min(zoom, Math.sqrt(MAX_STILL / (full[0] * full[1]))), 1) : 1;
   const size = full.map((side) => Math.round(side * larger)), isSame = stillCanvas.width === size[0] && stillCanvas.height === size[1];
-  drawAt(...(photographs.isOpaque || isZoom ? size : [canvas.width, canvas.height])); // it can be copied in the task that drew it
+  drawAt(...(photographs.isOpaque || grows ? size : [canvas.width, canvas.height])); // it can be copied in the task that drew it
   const context = stillCanvas.getContext("2d");
   context.globalAlpha = stillCanvas.hidden || !isSame ? 1 : 1 - Number(stillCanvas.style.opacity);
   if (!isSame) [stillCanvas.width, stillCanvas.height] = size;

@@ -1,9 +1,9 @@
 // Vectors, matrices (arrays of rows), and the graph of a tour. The functions of the graph give the results of those of
-// pansplat.tours.graph, walks and limits that they name; tests/web/test_modules.py compares them.
+// pansplat.tours.graph, walks, limits and outlook that they name; tests/web/test_modules.py compares them.
 //
 // A graph has `positions` and `parts` of panoramas; `edges`, whose first two numbers are panoramas; the `next` panorama
-// on the way from one (row) to another one (column); the `poor` edges, along which the image fades; the `hysteresis` of a change of edge; the `reach` around a part,
-// within which a camera that has jumped is in it; and the `clearances` of panoramas, relative to the axes `level`.
+// on the way from one (row) to another one (column); the `poor` edges, along which the camera zooms; the `hysteresis` of a
+// change of edge; the `reach` around a part, within which a camera that has jumped is in it; and the `clearances` of panoramas, relative to the axes `level`.
 // Edges are numbers in `edges`.
 
 export const DEGREE = Math.PI / 180;
@@ -57,19 +57,19 @@ export function followEdge(graph, position, current) {
   return distanceToEdge(graph, current, position) <= limit ? current : nearest;
 }
 
-// limit_step; in a scene without edges, surfaces alone limit it
+// limit_step
 export function limitStep(graph, start, end, part = null) {
-  const edge = graph.edges.length ? nearestEdge(graph, end, part) : null;
-  const target = edge !== null && isPoor(graph, edge) ? limitAlong(graph, edge, start, end, part) : end;
+  const edge = nearestEdge(graph, end, part);
+  const target = isPoor(graph, edge) ? limitAlong(graph, edge, start, end, part) : end;
   const most = Math.min(measureFree(graph, edge, start)[0], 0), [free, away] = measureFree(graph, edge, target);
   const slid = minus(target, scaled(away, Math.max(most - free, 0)));
   const isStep = distanceOf(slid, start) <= distanceOf(target, start) + 1e-9;
   return isStep && measureFree(graph, edge, slid)[0] >= most - 1e-9 ? slid : start;
 }
 
-// measure_free; of all panoramas without an edge
+// _measure_free
 function measureFree(graph, edge, place) {
-  const nodes = edge === null ? [...graph.positions.keys()] : graph.edges[edge].slice(0, 2);
+  const nodes = graph.edges[edge].slice(0, 2);
   const found = nodes.filter((node) => graph.clearances[node].length).map((node) => {
     const offset = minus(place, graph.positions[node]), distance = Math.hypot(...offset);
     const free = Math.max(findClearance(graph, node, offset) - distance - HEADER.clearance, HEADER.clearance - distance);
@@ -77,11 +77,11 @@ function measureFree(graph, edge, place) {
   });
   if (!found.length) return [Infinity, [0, 0, 0]];
   const [free, away] = found.reduce((best, each) => each[0] > best[0] ? each : best);
-  const beside = edge === null || isPoor(graph, edge) ? -Infinity : HEADER.clearance - distanceToEdge(graph, edge, place);
+  const beside = isPoor(graph, edge) ? -Infinity : HEADER.clearance - distanceToEdge(graph, edge, place);
   return [Math.max(free, beside), away];
 }
 
-// find_bin, of a horizon of `count` bins
+// find_bins, of one yaw and a horizon of `count` bins
 export const findBin = (yaw, count) => Math.floor((wrapAngle(yaw) / (2 * Math.PI) + 0.5) * count) % count;
 
 // find_clearance
@@ -104,17 +104,17 @@ function limitAlong(graph, edge, start, end, part) {
   return minus(end, scaled(along, dot(minus(end, first), along) < length / 2 ? excess : -excess));
 }
 
-const isPoor = (graph, edge) => isFade(graph, ...graph.edges[edge].slice(0, 2));
+const isPoor = (graph, edge) => isZoom(graph, ...graph.edges[edge].slice(0, 2));
 
-// is_fade
-export const isFade = (graph, from, to) => {
+// is_zoom
+export const isZoom = (graph, from, to) => {
   return graph.parts[from] !== graph.parts[to] || graph.poor.some((edge) => edge.includes(from) && edge.includes(to) && from !== to);
 };
 
 // find_way
 export function findWay(graph, position, node, part = null) {
   const ends = graph.edges[nearestEdge(graph, position, part)].slice(0, 2), [from, to] = ends.map((end) => distanceOf(graph.positions[end], position));
-  if (isFade(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1]; // no camera flies to the other end
+  if (isZoom(graph, ...ends)) ends[from <= to ? 1 : 0] = ends[from <= to ? 0 : 1]; // no camera flies to the other end
   const ways = ends.map((start) => {
     const way = [start];
     while (way.at(-1) !== node) way.push(graph.next[way.at(-1)][node]);
@@ -122,9 +122,9 @@ export function findWay(graph, position, node, part = null) {
   });
   const [first, second] = ways.map((way) => {
     const places = [position, ...way.map((each) => graph.positions[each])];
-    const fades = way.map((each, i) => i > 0 && isFade(graph, way[i - 1], each));
-    const lengths = fades.map((fade, i) => fade ? 0 : distanceOf(places[i], places[i + 1]));
-    return [fades.filter(Boolean).length, lengths.reduce((a, b) => a + b)];
+    const zooms = way.map((each, i) => i > 0 && isZoom(graph, way[i - 1], each));
+    const lengths = zooms.map((zoom, i) => zoom ? 0 : distanceOf(places[i], places[i + 1]));
+    return [zooms.filter(Boolean).length, lengths.reduce((a, b) => a + b)];
   });
   return first[0] < second[0] || (first[0] === second[0] && first[1] <= second[1]) ? ways[0] : ways[1];
 }

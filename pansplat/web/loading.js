@@ -33,7 +33,7 @@ function receive(view, isLast, chunk) {
 }
 
 // In a page of one file a script for each chunk of the data calls this.
-window.addPart = (view, isLast) => receive(view, isLast, takeText());
+window.addChunk = (view, isLast) => receive(view, isLast, takeText());
 
 // A file of the folder beside the page. A cache may hold what a server has answered in its place before.
 export async function fetchFile(name, isAgain) {
@@ -52,7 +52,7 @@ export async function fetchFile(name, isAgain) {
   }
 }
 
-// The next file waits for this one, but not for its later tries, which do not end. A page without any Gaussians fails.
+// Files load one by one. A file that fails is tried again for ever, in the background. A page without any Gaussians fails.
 function loadView(view, tries = 1) {
   queue = queue.then(async () => {
     const blob = await fetchFile(...HEADER.views[view].files, tries > 1), chunk = await blob.arrayBuffer();
@@ -71,15 +71,14 @@ function loadView(view, tries = 1) {
 
 const countChunks = () => [...state.requested].reduce((sum, view) => sum + HEADER.views[view].files.length, 0);
 
-// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends; all without edges.
+// Loads what the camera needs: the views of the edges at its panorama, and where a flight ends.
 export function loadAround() {
   if (state.requested.size === HEADER.loading.length) return;
-  const nodes = [nodeHere(), ...(state.flight ? [state.flight.spot] : [])];
+  const nodes = [nodeHere(), ...(state.way ? [state.way.spot] : [])];
   const groups = edges.filter(([a, b]) => nodes.includes(a) || nodes.includes(b)).map(([, , each]) => each);
   const near = new Set([...groups, state.group].flatMap((each) => HEADER.groups[each]));
-  const isAll = HEADER.folder === null || !edges.length;
   for (const view of HEADER.loading) {
-    if (state.requested.has(view) || !(isAll || near.has(view))) continue;
+    if (state.requested.has(view) || !(HEADER.folder === null || near.has(view))) continue;
     state.requested.add(view);
     canvas.ariaBusy = true;
     if (HEADER.folder !== null) loadView(view);

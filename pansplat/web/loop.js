@@ -5,7 +5,7 @@ import { nodeWithin, showViews, tangentOf, updateEdge, walk } from "./camera.js"
 import { orbitByKeys } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { embed } from "./embed.js";
-import { advanceDollFlight, advanceFlight, isWaiting, updateStill } from "./flight.js";
+import { advanceDollFlight, advanceWay, isWaiting, updateStill } from "./flight.js";
 import { clamp, inAxes, minus, scaled } from "./graph.js";
 import { loadAround, requestSort } from "./loading.js";
 import { measure } from "./measure.js";
@@ -14,7 +14,7 @@ import { photographs } from "./photographs.js";
 import { drawAt } from "./picture.js";
 import { plan } from "./plan.js";
 import { placeRings, showPlace } from "./rings.js";
-import { camera, currentPart, edges, isComplete, isSortedFor, shown, state } from "./state.js";
+import { camera, currentPart, isComplete, isSortedFor, shown, state } from "./state.js";
 
 const SLOW_MS = 45, FAST_MS = 25; // times of a frame: above the first the resolution falls, below the second it rises
 const PAUSE_MS = 1000; // a longer frame is not measured
@@ -28,21 +28,21 @@ let lastFrame = 0;
 // Whether the picture is final: all data is there and sorted for the camera, nothing moves or fades, and it is drawn.
 export function isSettled() {
   const isDrawn = state.headset.session !== null || !state.isDirty && state.drawnScale === 1, tolerance = state.headset.session ? SORT_DISTANCE : 0;
-  const isMoving = state.doll.isDue || [state.flight, state.doll.flight, state.fade, state.still].some((each) => each !== null);
+  const isMoving = state.doll.isDue || [state.way, state.doll.flight, state.fade, state.still].some((each) => each !== null);
   return isDrawn && !isMoving && photographs.isFinal() && isComplete() && isSortedFor(camera.position, currentPart(), tolerance) &&
     state.sorted.views.every((view) => shown[view] === 1);
 }
 
 // Moves what moves by itself, `seconds` after the last time.
 export function advance(now, seconds) {
-  advanceFlight(now);
+  advanceWay(now);
   advanceDollFlight(now);
-  if (edges.length && !state.doll.isOn) updateEdge(now);
+  if (!state.doll.isOn) updateEdge(now);
   showViews(seconds / HEADER.fadeSeconds);
   photographs.update(seconds);
   updateStill(now);
   loadAround();
-  const isMoving = state.flight !== null || state.doll.flight !== null || isWaiting();
+  const isMoving = state.way !== null || state.doll.flight !== null || isWaiting();
   embed.follow(isMoving ? null : nodeWithin(HEADER.ringRadius), isMoving);
 }
 
@@ -63,7 +63,7 @@ export function onFrame(now) {
   if (!state.renderer || !(state.sorted || photographs.isOpaque) || !(state.isDirty || wanted > state.drawnScale)) return;
   state.isDirty = false;
   state.drawnScale = wanted;
-  const shift = scaled(minus(camera.position, before), state.flight && !state.still ? Math.min(EXPOSURE_MS / Math.max(elapsed, 1), 1) : 0);
+  const shift = scaled(minus(camera.position, before), state.way && !state.still ? Math.min(EXPOSURE_MS / Math.max(elapsed, 1), 1) : 0);
   const rotation = drawAt(...fullSize().map((side) => Math.max(Math.round(side * wanted), 1)), shift);
   placeRings(rotation);
   showMarks(rotation);

@@ -1,5 +1,5 @@
 // The page: starts when the first views are there, and answers scripts. docs/web.md describes it. HEADER, SHADERS and
-// WORKER of all modules are constants that export/page.py writes before them.
+// WORKER of all modules are constants that export/page_files.py writes before them.
 
 import { cameraFor, settleAt, showViews, tallOf } from "./camera.js";
 import { byId, canvas } from "./dom.js";

@@ -39,8 +39,8 @@ async function readTile({ key, tries }) {
   return image;
 }
 
-// One size of a photograph. `status` of a tile: null, or "reading", "ready" or "failed", which is after the last one of its `tries`; `due`:
-// the time of the next one.
+// One size of a photograph. `status` of a tile: null (not requested), "reading", "ready", "failed" (after TRIES tries); `due`: the
+// time of the next try.
 class Level {
   texture = null;
   isFresh = true;
@@ -123,14 +123,15 @@ class Photographs {
     return node === null || this.listMissing(node, size, true).every(({ status }) => status === "failed");
   }
 
-  // The panorama at which the camera stands, as no eye of a headset does; the nearest where there is nothing else to show.
+  // The panorama at which the camera stands; null in a headset, whose eyes are beside it. In a part without Gaussians: the nearest
+  // panorama.
   findNode() {
     return nodeWithin(isFixed() ? Infinity : state.headset.session ? -1 : HEADER.stopReach);
   }
 
   // What is shown of a flight: the photographs of both ends, near them.
   findFlown() {
-    const [leg] = state.flight?.legs || [];
+    const [leg] = state.way?.legs || [];
     if (!leg?.path || !leg.done || state.headset.session) return null;
     const isFirst = leg.done < 0.5, node = isFirst ? leg.from : leg.to;
     const isReady = node !== null && this.levelsOf(node)[0].isReady;
@@ -191,7 +192,7 @@ class Photographs {
     }
     const isStill = this.last !== null && distanceOf(camera.position, this.last) === 0 || state.headset.session !== null;
     this.last = [...camera.position];
-    const next = state.flight?.legs.find(({ to }) => to !== undefined), flown = this.findFlown();
+    const next = state.way?.legs.find(({ to }) => to !== undefined), flown = this.findFlown();
     this.wanted = next ? next.to : nodeHere();
     this.read(this.wanted, size, next?.view);
     if (flown) {

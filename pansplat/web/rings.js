@@ -1,7 +1,7 @@
 // The panoramas that can be visited: rings in the picture, arrows at its border, the list, and the name of the one at the camera.
 
 import { nodeHere, tangentOf } from "./camera.js";
-import { chooseRings, findLink, isCovered } from "./choices.js";
+import { findLink, isCovered } from "./choices.js";
 import { isInDoll, placeInDoll } from "./doll.js";
 import { byId, canvas, make } from "./dom.js";
 import { goTo } from "./flight.js";
@@ -10,30 +10,29 @@ import { camera, state } from "./state.js";
 
 const ARROW = 44, BORDER = 8; // pixels: size of an arrow, and to the border
 const MAX_ARROWS = 3; // largest number of arrows at a side of the picture
-let rings = [], chosenFor = null, chosen = []; // all rings; the nearest panorama, and its rings
+let rings = [], chosenFor = null, chosen = []; // all rings, those of links with the panorama that they are offered `from`; the nearest panorama, and its rings
 
 export function makeRings() {
-  const links = HEADER.links.filter((link) => link.mark);
-  const marks = [...HEADER.spots.map((_, node) => ({ node, link: null })), ...links.map((link) => ({ node: link.to, link }))];
-  rings = marks.map(({ node, link }) => {
+  const ofLinks = HEADER.spots.flatMap((spot, from) => spot.rings.filter(({ mark }) => mark).map(({ node, mark }) => ({ node, from, mark })));
+  rings = [...HEADER.spots.map((_, node) => ({ node, from: null, mark: null })), ...ofLinks].map(({ node, from, mark: linked }) => {
     const { name, position, mark } = HEADER.spots[node], text = make("small", "");
     const label = make("span", "", make("b", "", name), text), button = make("button", "", label);
-    const place = link ? { mark: link.mark, camera: null } : { mark, camera: position };
+    const place = linked ? { mark: linked, camera: null } : { mark, camera: position };
     const heightOf = (point) => dot(column(HEADER.level, 1), point);
-    const isUpright = link !== null && heightOf(link.mark) < heightOf(HEADER.spots[link.from].mark) - 0.5 * HEADER.ringRadius;
+    const isUpright = from !== null && heightOf(place.mark) < heightOf(HEADER.spots[from].mark) - 0.5 * HEADER.ringRadius;
     button.hidden = true;
     button.onclick = () => goTo(node);
     byId("spots").append(button);
-    return { node, link, button, label, text, ...place, isUpright, size: null };
+    return { node, from, button, label, text, ...place, isUpright, size: null };
   });
 }
 
-// Chooses the rings of the nearest panorama. A link's text is a part of the label.
+// Takes the rings of the nearest panorama. A link's text is a part of the label.
 function update() {
   const here = nodeHere();
   if (chosenFor === here) return;
   chosenFor = here;
-  chosen = chooseRings(here).map(({ node, link }) => rings.find((ring) => ring.node === node && ring.link === link));
+  chosen = HEADER.spots[here].rings.map(({ node, mark }) => rings.find((ring) => ring.node === node && ring.from === (mark ? here : null)));
   for (const ring of chosen) {
     const { name } = HEADER.spots[ring.node], link = findLink(here, ring.node);
     ring.text.textContent = link && link.text !== name ? link.text : "";
@@ -46,20 +45,20 @@ function update() {
 // The rings of the nearest panorama, without that at the camera; in the doll's house those of all panoramas in it.
 export function findRings() {
   update();
-  if (state.doll.isOn) return rings.filter(({ link, node }) => !link && isInDoll(node));
+  if (state.doll.isOn) return rings.filter(({ from, node }) => from === null && isInDoll(node));
   return chosen.filter((ring) => ring.camera === null || distanceOf(ring.camera, camera.position) >= HEADER.ringDistance);
 }
 
 // Rings in perspective, and arrows at the border to those that are outside or under a control, and to panoramas of which no place
 // is known; none while the camera flies. A label that would cover a control or the label of a nearer ring is not shown.
 export function placeRings(rotation) {
-  const found = state.flight?.legs[0].path ? [] : findRings();
+  const found = state.way?.legs[0].path ? [] : findRings();
   const { clientWidth: width, clientHeight: height } = canvas, focal = 0.5 * height / tangentOf(width, height);
   const bars = ["buttons", "place", "plan"].map((id) => byId(id).getBoundingClientRect()).map((bar) => [bar.left, bar.top, bar.right, bar.bottom]);
   const taken = [...bars], sides = { left: 0, right: 0, up: 0, down: 0 };
   for (const { button } of rings) button.hidden = true;
   const placed = found.map((ring) => {
-    const isKnown = ring.link || state.doll.isOn || HEADER.plan.worlds[ring.node] === HEADER.plan.worlds[nodeHere()];
+    const isKnown = ring.from !== null || state.doll.isOn || HEADER.plan.worlds[ring.node] === HEADER.plan.worlds[nodeHere()];
     const isMoved = state.doll.isOn && isInDoll(ring.node), mark = isMoved ? placeInDoll(ring.node, ring.mark).place : ring.mark;
     const offset = minus(mark, camera.position);
     return { ring, offset, distance: Math.hypot(...offset), place: isKnown ? findPlace(ring, inAxes(rotation, offset), focal, bars) : null };

@@ -1,5 +1,5 @@
-// All that changes while the page is shown. Every module but the renderers is functions of it and of HEADER, which is
-// PageHeader of pansplat/export/page_data.py. This module, graph.js, camera.js, choices.js and doll.js need no browser.
+// What several modules change while the page is shown; what one module alone changes is in that module. HEADER is PageHeader of
+// pansplat/export/page_data.py. This module, graph.js, camera.js, choices.js and doll.js need no browser.
 
 import { distanceOf, partOfEdge } from "./graph.js";
 
@@ -22,7 +22,7 @@ export const shown = HEADER.views.map(() => 0);
 export const state = {
   // The edge at the camera, and the group that is blended there; `fade` is from the views of another group.
   edge: 0,
-  group: edges.length ? edges[0][2] : 0,
+  group: edges[0][2],
   fade: null,
   // Views whose data is requested, those whose data is there, and those whose data does not arrive and is still tried.
   requested: new Set(),
@@ -37,7 +37,7 @@ export const state = {
   drawnScale: 0,
   lastChange: 0,
   // flight.js
-  flight: null,
+  way: null,
   isTouring: false,
   still: null,
   doll: { isOn: false, isDue: false, node: 0, heading: null, flight: null, center: null, offsets: [], size: null, first: 0, zoom: 1, fov: 0, covered: [0, 0] },
@@ -57,14 +57,14 @@ export function refresh() {
   state.isDirty = true;
 }
 
-// Draws the next frame, which another one has replaced.
+// Draws again, because `render` has drawn another picture on the canvas.
 export function redraw() {
   state.drawnScale = 0;
   changed();
 }
 
-export const currentPart = () => edges.length ? partOfEdge(GRAPH, state.edge) : 0;
-export const endsOfEdge = () => edges.length ? edges[state.edge].slice(0, 2) : [];
+export const currentPart = () => partOfEdge(GRAPH, state.edge);
+export const endsOfEdge = () => edges[state.edge].slice(0, 2);
 export const isComplete = () => [...state.requested].every((view) => state.received.has(view) || state.missing.has(view));
 
 // Whether the order is that of a camera; the doll's house needs none.

@@ -6,7 +6,7 @@
 
 import { blendWeights, findSpot, floorPoint, walk } from "./camera.js";
 import { byId, calm, explain } from "./dom.js";
-import { coverage, goHome, goTo, isFlying, jumpTo, setTouring } from "./flight.js";
+import { coverage, goHome, goTo, isOnWay, jumpTo, setTouring } from "./flight.js";
 import { clamp, column, cross, distanceOf, dot, fromAxes, minus, multiply, plus, scaled, unit } from "./graph.js";
 import { requestSort } from "./loading.js";
 import { advance, SORT_DISTANCE } from "./loop.js";
@@ -141,7 +141,7 @@ class Headset {
     this.left = [...camera.position];
     requestSort(SORT_DISTANCE);
     this.adaptScale(1000 * seconds);
-    this.motion += (Number(isWalking || isFlying()) - this.motion) * Math.min(8 * seconds, 1);
+    this.motion += (Number(isWalking || isOnWay()) - this.motion) * Math.min(8 * seconds, 1);
     const marks = this.findMarks(frame), layer = session.renderState.baseLayer;
     for (const view of pose.views) {
       if (view.requestViewportScale) view.requestViewportScale(this.scale);
@@ -243,7 +243,7 @@ class Headset {
     }
     this.isTurned = Math.abs(turn) > (this.isTurned ? 0.3 : 0.6);
     if (Math.hypot(right, forward) < DEAD_ZONE) return false;
-    if (isFlying()) setTouring(false);
+    if (isOnWay()) setTouring(false);
     walk(...scaled([right, 0, forward], seconds * HEADER.speed));
     return true;
   }
@@ -274,8 +274,8 @@ class Headset {
 
   // ---- resolution ----
 
-  // Lowers the resolution when frames are late, and raises it after some steady seconds, the more of them the more often that
-  // has made frames late.
+  // Lowers the resolution when frames are late, and raises it after some steady seconds. Each raise that made frames late doubles
+  // the wait before the next.
   adaptScale(elapsed) {
     const { session, scale, times } = this;
     times.push(elapsed);

@@ -125,7 +125,7 @@ def test_a_folder_of_three_panoramas_is_exported_as_a_tour(tmp_path, write_tour,
 
 
 def test_a_pair_is_merged_to_the_limit_of_its_page_before_its_refinement(tmp_path, write_tour, capsys, monkeypatch):
-    monkeypatch.setattr(page_module, "_merge", None)  # must not be called
+    monkeypatch.setattr(page_module, "merge", None)  # must not be called
     command = ["export", str(write_tour(tmp_path / "house", height=64)), "--model", "sphere", "--refine", "2"]
     out = tmp_path / "page.html"
     assert run([*command, "--predict-height", "64", "--pair", "2", "--gaussians", "2000", "-o", str(out)]) == 0

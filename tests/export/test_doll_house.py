@@ -18,10 +18,10 @@ from pansplat.export.doll_house import DollHouse, _fill, _measure, _pack, _Paint
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
-from pansplat.tours.doll_house import Rooms
+from pansplat.tours.houses import Houses
 from pansplat.tours.linked_rooms import DrawnPlace
-from pansplat.tours.merge import make_graph
 from pansplat.tours.plan import Door, Plan, Room
+from pansplat.tours.scene_graph import make_graph
 
 FLOOR, CEILING = 1.5, -1.1  # from the cameras, downwards
 BOXES = (box(0, 0, 5, 4), box(5.2, 0, 8, 4))
@@ -50,12 +50,12 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def rooms(scene: Scene) -> Rooms:
-    """The known rooms."""
+def houses(scene: Scene) -> Houses:
+    """One house of the known rooms."""
     outlines = [np.array(box.exterior.coords)[:-1] for box in BOXES]
     found = (Room("", (0, 1), outlines[0], 0, True), Room("", (2,), outlines[1], 0, True))
     plan = Plan(make_graph(scene), found, (DOOR,), FLOOR, None, None, 3, 0)
-    return Rooms(np.full(3, FLOOR), np.full(3, -CEILING), ((0, 1, 2),), plan)
+    return Houses(np.full(3, FLOOR), np.full(3, -CEILING), ((0, 1, 2),), plan)
 
 
 def _color(places: np.ndarray) -> np.ndarray:
@@ -98,8 +98,8 @@ def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return places, atlas[row, column]
 
 
-def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(scene, rooms, photograph) -> None:
-    house = make_house(scene, rooms, photograph())
+def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(scene, houses, photograph) -> None:
+    house = make_house(scene, houses, photograph())
     places, colors = _sample(house)
     walls = shapely.union_all([outline.exterior for outline in (*BOXES, PASSAGE)])
     to_wall = shapely.distance(walls, shapely.points(places[:, [0, 2]]))
@@ -110,8 +110,8 @@ def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(scene, ro
     assert np.median(errors) < 0.02 and np.quantile(errors, 0.95) < 0.06
 
 
-def test_fronts_face_the_room(rooms: Rooms) -> None:
-    for panel in build_panels(rooms, lambda *_: False):
+def test_fronts_face_the_room(houses: Houses) -> None:
+    for panel in build_panels(houses, lambda *_: False):
         normal = np.cross(panel.down, panel.right)
         middle = panel.locate(np.array(panel.shape.representative_point().coords[0]))
         if panel.facing is not None:
@@ -122,8 +122,8 @@ def test_fronts_face_the_room(rooms: Rooms) -> None:
             assert (BOXES[panel.room] | PASSAGE).buffer(1e-6).contains(shapely.Point(inside[[0, 2]]))
 
 
-def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(rooms: Rooms) -> None:
-    panels = [panel for panel in build_panels(rooms, lambda *_: False) if panel.facing is None]
+def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(houses: Houses) -> None:
+    panels = [panel for panel in build_panels(houses, lambda *_: False) if panel.facing is None]
 
     def find(place: tuple[float, float, float]) -> list[int]:
         return [
@@ -140,20 +140,20 @@ def test_a_door_to_another_room_is_a_gap_in_both_walls_below_its_top(rooms: Room
         assert find((x, -0.9, 1.45)) == [room] and find((x, 0.5, 2.5)) == [room]
     assert find((5.1, FLOOR, 1.45)) == [0] and find((5.1, FLOOR, 2.5)) == [], "the ground below the door"
     assert find((5.1, 0.5, 1.0)) == find((5.1, 0.5, 1.9)) == [0] and find((5.1, -0.9, 1.0)) == [], "the jambs"
-    closed = dataclasses.replace(rooms, plan=dataclasses.replace(rooms.plan, doors=()))
+    closed = dataclasses.replace(houses, plan=dataclasses.replace(houses.plan, doors=()))
     outward = Door(np.array(((1.0, 0.0), (2.0, 0.0))), (0,))  # a window of a room's height
-    window = dataclasses.replace(rooms, plan=dataclasses.replace(rooms.plan, doors=(outward,)))
+    window = dataclasses.replace(houses, plan=dataclasses.replace(houses.plan, doors=(outward,)))
     for other in (closed, window):
         panels = [panel for panel in build_panels(other, lambda *_: False) if panel.facing is None]
         assert find((5.0, 0.5, 1.45)) == [0] and find((1.5, 0.5, 0.0)) == [0]
 
 
-def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(scene, rooms, photograph) -> None:
+def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(scene, houses, photograph) -> None:
     pairs = photograph((200, 0, 0), (0, 0, 200), (0, 200, 0))
     hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)
     screen = Gaussians.cat([scene.gaussians, make_balls(hidden, 0.03, views=0)])
     for shown, expected in ((scene, 0), (dataclasses.replace(scene, gaussians=screen), 2)):
-        house = make_house(shown, rooms, pairs)
+        house = make_house(shown, houses, pairs)
         places, colors = _sample(house, 3000)
         own = colors.argmax(axis=1)
         x, y, z = places.T
@@ -181,12 +181,12 @@ def test_what_no_camera_sees_has_the_colours_around_it() -> None:
     assert np.allclose(nothing, (0.1, 0.5, 0.9)), "of the other walls"
 
 
-def test_a_room_of_another_world_stands_beside_the_house_on_its_floor(scene: Scene, rooms: Rooms) -> None:
+def test_a_room_of_another_world_stands_beside_the_house_on_its_floor(scene: Scene, houses: Houses) -> None:
     """It is turned by a quarter to the right, and its camera is lower."""
-    plan = dataclasses.replace(rooms.plan, doors=())
+    plan = dataclasses.replace(houses.plan, doors=())
     vars(plan)["drawn"] = {2: DrawnPlace(0, math.pi / 2, np.array((8.0, 10.0)))}
     floors = np.array((FLOOR, FLOOR, FLOOR - 0.2))
-    apart = dataclasses.replace(rooms, plan=plan, floors=floors, houses=((0, 1), (2,)))
+    apart = dataclasses.replace(houses, plan=plan, floors=floors, views=((0, 1), (2,)))
     house = make_house(scene, apart)
     (corners,), ((*_, moved),) = house.corners, (house.nodes[0].values(),)
     assert len(house.nodes) == 1 and moved[0] == math.pi / 2
@@ -197,8 +197,8 @@ def test_a_room_of_another_world_stands_beside_the_house_on_its_floor(scene: Sce
     assert corners[~is_moved & is_wall].max(axis=0)[:3] == pytest.approx((5, FLOOR, 4), abs=1e-3), "the others stay"
 
 
-def test_textures_of_many_rooms_fit_into_the_atlas(rooms: Rooms) -> None:
-    panels = [panel for panel in build_panels(rooms, lambda *_: False) if panel.facing is None] * 12
+def test_textures_of_many_rooms_fit_into_the_atlas(houses: Houses) -> None:
+    panels = [panel for panel in build_panels(houses, lambda *_: False) if panel.facing is None] * 12
     density, places = _pack(panels, 100.0)
     boxes = [box(*place, *(place + _measure(panel, density))) for panel, place in zip(panels, places, strict=True)]
     assert shapely.union_all(boxes).area == pytest.approx(sum(each.area for each in boxes)), "none covers another one"
@@ -206,25 +206,25 @@ def test_textures_of_many_rooms_fit_into_the_atlas(rooms: Rooms) -> None:
     assert density < 100
 
 
-def test_without_a_house_there_is_no_atlas(scene: Scene, rooms: Rooms) -> None:
-    house = make_house(scene, dataclasses.replace(rooms, houses=()))
+def test_without_a_house_there_is_no_atlas(scene: Scene, houses: Houses) -> None:
+    house = make_house(scene, dataclasses.replace(houses, views=()))
     assert (house.corners, house.atlas) == ((), b"")
 
 
-def test_without_photographs_the_gaussians_are_shown(scene: Scene, rooms: Rooms) -> None:
+def test_without_photographs_the_gaussians_are_shown(scene: Scene, houses: Houses) -> None:
     means = scene.gaussians.means
     color = torch.from_numpy(_color(means.numpy()))
     gaussians = make_balls(means, 0.03, 0.99, color=color, views=scene.gaussians.views)
-    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), rooms)
+    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), houses)
     places, colors = _sample(house)
     assert np.median(np.abs(colors - _color(places)).max(axis=1)) < 0.1
 
 
-def test_a_wall_that_the_cameras_see_through_is_open(scene: Scene, rooms: Rooms) -> None:
+def test_a_wall_that_the_cameras_see_through_is_open(scene: Scene, houses: Houses) -> None:
     own = scene.gaussians.select(scene.gaussians.views != 1)
     seen = make_balls(see_box(_box_of(0)[0], _box_of(2)[1], np.array(CAMERAS[1]), 20_000), 0.03, views=1)
     through = dataclasses.replace(scene, gaussians=Gaussians.cat([own, seen]))
     for shown, expected in ((scene, False), (through, True)):
-        painter = _Painter(shown, rooms, ())
+        painter = _Painter(shown, houses, ())
         assert painter.is_open(0, np.array(((5.0, 0.5), (5.0, 3.5))), FLOOR) == expected
         assert not painter.is_open(0, np.array(((0.0, 3.5), (0.0, 0.5))), FLOOR)

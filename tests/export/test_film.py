@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic_scenes import make_balls
+from synthetic_scenes import make_balls, place_cameras, see_box
 
-from pansplat.export.film import Film, FilmPhotographs, follow_path, list_flight, plan_visits, write_film
-from pansplat.gaussians.scene import Scene
+from pansplat.export.film import Film, FilmPhotographs, follow_path, list_frames, plan_visits, write_film
+from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.rendering.image_planes import image_planes
@@ -119,6 +119,21 @@ def test_a_film_of_two_panoramas_moves_as_that_of_a_tour(scene: Scene) -> None:
     route = plan_visits(TourFacts(scene))
     kinds = [step.kind for step in route.steps]
     assert kinds == ["rest", "flight", "rest"] and route.walk == (0, 1)
-    shots = list_flight(route, 24.0, 75.0)
+    shots = list_frames(route, 24.0, 75.0)
     assert len(shots) == round(24 * route.seconds) and shots[-1].moment.photograph == 1
-    assert [shot.seconds for shot in list_flight(route, 24.0, 75.0, 0.01)] == [0, route.seconds], "two frames at least"
+    assert [shot.seconds for shot in list_frames(route, 24.0, 75.0, 0.01)] == [0, route.seconds], "two frames at least"
+
+
+def test_a_film_zooms_along_a_poor_edge_and_flies_along_others() -> None:
+    """The third panorama shows the room nearer and lighter."""
+    poses = place_cameras((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+    views = []
+    for view, (center, factor, shade) in enumerate(zip(poses[:, :3, 3], (1, 1, 0.6), (0.5, 0.5, 0.9), strict=True)):
+        seen = see_box(torch.tensor((-3.0, -1.0, -3.0)), torch.tensor((5.0, 1.5, 3.0)), center, 5000)
+        means, color = center + factor * (seen - center), torch.full_like(seen, shade)
+        views.append(make_balls(means, 0.02, 1.0, color=color, views=view))
+    tour = SceneTour(((0, 1, 1.0), (1, 2, 1.0)))
+    facts = TourFacts(Scene(Gaussians.cat(views), poses, 0.45, 10.0, tour=tour))
+    assert facts.graph.poor == ((1, 2),) and facts.graph.clearances.keys() == {0, 1, 2}
+    steps = {step.nodes: step.kind for step in plan_visits(facts).steps if step.nodes[0] != step.nodes[1]}
+    assert steps == {(0, 1): "flight", (1, 2): "zoom"}

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pansplat.gaussians.scene import Gaussians, Scene
-from pansplat.gaussians.scene_files import format_entry, make_scene
+from pansplat.gaussians.scene_files import format_entry, restore_scene
 
 COUNT = 12
 _POSES = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
@@ -19,7 +19,7 @@ ENTRY = json.loads(format_entry(Scene(GAUSSIANS, _POSES, near=0.45, far=10.0), [
 
 
 def read(text: str) -> Scene:
-    return make_scene(GAUSSIANS, text, Path("scene.ply"))
+    return restore_scene(GAUSSIANS, text, Path("scene.ply"))
 
 
 @pytest.mark.parametrize("value", [True, False, None, 1, "yes"])

@@ -22,7 +22,7 @@ from pansplat.model.network import (
     NetworkPredictor,
     build_network,
     convert_checkpoint,
-    load_predictor,
+    load_network_predictor,
     remove_masked_gaussians,
     require_precision,
 )
@@ -114,7 +114,7 @@ def test_the_fingerprint_depends_on_weights_settings_compatibility_and_precision
         _predictor(small_config, seed=1),
         _predictor(small_config, "official"),
         _predictor(other),
-        load_predictor(file, attention_precision="bfloat16"),
+        load_network_predictor(file, attention_precision="bfloat16"),
     )
     assert len({predictor.fingerprint for predictor in predictors}) == 5
     assert _predictor(small_config).fingerprint == predictors[0].fingerprint
@@ -225,7 +225,7 @@ def test_weights_load_with_the_compat_of_their_training_by_default(file: Path) -
 def test_a_loaded_network_predicts_as_the_saved_one(file: Path, small_config: PanSplatConfig) -> None:
     torch.manual_seed(3)
     saved = NetworkPredictor("pansplat", PanSplat(small_config))
-    loaded = load_predictor(file)
+    loaded = load_network_predictor(file)
     assert loaded.name == "pansplat"
     assert loaded.fingerprint == saved.fingerprint
     means, expected = (predictor(*_inputs(), 0.5, 10.0).means for predictor in (loaded, saved))
@@ -236,7 +236,7 @@ def test_loading_draws_no_random_numbers_and_fills_every_tensor(file: Path) -> N
     torch.manual_seed(0)
     expected = torch.rand(3)
     torch.manual_seed(0)
-    network = _network_of(load_predictor(file))
+    network = _network_of(load_network_predictor(file))
     assert torch.equal(torch.rand(3), expected)
     held = [*network.parameters(), *network.buffers()]
     assert not any(tensor.is_meta for tensor in held)

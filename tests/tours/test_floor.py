@@ -13,7 +13,7 @@ from pansplat.inputs.panorama_sets import Panorama
 from pansplat.tours import floor
 from pansplat.tours.floor import find_floor_outline
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.merge import make_graph
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.surfaces import find_surfaces
 
 

@@ -13,7 +13,7 @@ from pansplat.gaussians.scene import Scene, empty_gaussians
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.graph import find_tours
 from pansplat.tours.limits import follow_edge
-from pansplat.tours.merge import describe_tour, make_graph
+from pansplat.tours.scene_graph import describe_tour, make_graph
 from pansplat.tours.scene_views import choose_scene_views, choose_sources, leave_out
 from pansplat.tours.walks import find_walk, plan_walk
 

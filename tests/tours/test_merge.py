@@ -10,7 +10,8 @@ from synthetic_scenes import make_balls
 from pansplat.gaussians.scene import Scene, SceneTour, empty_gaussians
 from pansplat.inputs.placements import ApproximatePlace, Placement
 from pansplat.tours.linked_rooms import find_stated_place
-from pansplat.tours.merge import make_graph, merge_scenes, select_views
+from pansplat.tours.merge import merge_scenes, select_views
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.scene_views import choose_sources
 
 

@@ -67,7 +67,7 @@ def test_a_way_begins_at_the_better_end_of_the_nearest_edge(comb):
     assert find_way(comb, np.array((0.8, 0, 1.0)), 4) == [4]
 
 
-def test_a_poor_edge_is_a_fade_in_its_part_and_ways_around_it_are_better(make_tour):
+def test_a_poor_edge_is_a_zoom_in_its_part_and_ways_around_it_are_better(make_tour):
     square = make_tour(((0, 0), (0, 2), (2, 2), (2, 0)), ((0, 1), (1, 2), (2, 3), (0, 3)))
     poor = dataclasses.replace(square, poor=((0, 1),))
     assert find_walk(square, 0, 1) == [0, 1] and find_walk(poor, 0, 1) == [0, 3, 2, 1]

@@ -251,7 +251,7 @@ def test_clicking_the_widget_changes_the_image(user, label):
 
 CLICKS = [  # in the window of a pair, and what is then true
     ("click Fly", "state.playing"),
-    ("click Fly; click Stop", "not state.playing and 0 < state.flight < 1"),
+    ("click Fly; click Stop", "not state.playing and 0 < state.route_fraction < 1"),
     *[(f"click {display}", f"state.settings.display == '{display}'") for display in get_args(Display)],
     ("click depth; slide range 0.5 0.3", "state.settings.display_max > 6"),
     ("click visit; click visit-1; wait", "camera.position == (0, 0, 0.5)"),
@@ -269,7 +269,7 @@ def test_the_state_after_clicks_and_keys_of_imgui(user):
     io, start, failed = imgui.get_io(), ViewerState(), []
     before = user.read_image()
     for actions, expected in CLICKS:
-        for name in ("orbiting", "playing", "flight", "overlay", "help", "quit", "points", "settings"):
+        for name in ("orbiting", "playing", "route_fraction", "overlay", "help", "quit", "points", "settings"):
             setattr(user.state, name, getattr(start, name))
         user.state.camera, user.state.message = user.state.home, ""
         user.settle()
@@ -650,13 +650,13 @@ def test_a_photograph_is_dragged_turned_saved_shown_in_the_tour_and_undone(placi
     user.drag((x, y), (x + 0.6 * scale, y - 0.5 * scale))
     assert placing.place == pytest.approx((start.right + 0.6, start.forward + 0.5, start.yaw), abs=0.02)
 
-    camera, flight = user.state.camera, user.state.flight
+    camera, fraction = user.state.camera, user.state.route_fraction
     io.add_mouse_pos_event(*find_pixel())
     user.draw_frames(2)
     io.add_mouse_wheel_event(0.0, 2.0)
     user.draw_frames(2)
     assert placing.place.yaw == pytest.approx(start.yaw + np.radians(2), abs=1e-3)
-    assert (user.state.camera, user.state.flight) == (camera, flight), "the wheel turns the photograph only"
+    assert (user.state.camera, user.state.route_fraction) == (camera, fraction), "the wheel turns the photograph only"
     x, y = find_pixel()
     user.drag(window.find_knob(placing.place, 1.0), (x + 60, y + 2))  # to the right of the camera
     assert placing.is_aligned and placing.place.yaw == pytest.approx(np.pi / 2)

@@ -224,16 +224,19 @@ ROWS = [  # at the first of two panoramas, which are 0.5 m apart
     ],
     ("click 0.5 0.5; press f", "state.orbiting and camera.orbit_center == approx(state.points[0].position)"),
     ("press 2; wait 0.6", "state.playing and 0 < camera.position[2] < 0.5"),
-    ("press 2; wait 3", "camera.position == approx((0, 0, 0.5)) and state.flight == 1 and not state.playing"),
+    ("press 2; wait 3", "camera.position == approx((0, 0, 0.5)) and state.route_fraction == 1 and not state.playing"),
     ("press 2; wait 3; press 1; wait 3", "camera.position == approx((0, 0, 0)) and abs(camera.yaw_radians) > 3"),
     ("press 2; wait 3; press 3; wait 3", "camera.position == approx((0, 0, 0.5))"),
     ("press page down; wait 3", "camera.position == approx((0, 0, 0.5))"),
     ("press page down; wait 3; press page down; wait 3", "camera.position == approx((0, 0, 0))"),
     ("press page up; wait 3", "camera.position == approx((0, 0, 0.5))"),
     ("press space", "state.playing"),
-    ("press space; wait 12", "not state.playing and state.flight == 1 and camera.position == approx((0, 0, 0.5))"),
-    ("press space; wait 12; press space", "state.playing and state.flight < 0.1"),
-    ("press space; wait 1; press space; wait 1", "not state.playing and 0.1 < state.flight < 0.3"),
+    (
+        "press space; wait 12",
+        "not state.playing and state.route_fraction == 1 and camera.position == approx((0, 0, 0.5))",
+    ),
+    ("press space; wait 12; press space", "state.playing and state.route_fraction < 0.1"),
+    ("press space; wait 1; press space; wait 1", "not state.playing and 0.1 < state.route_fraction < 0.3"),
     ("press space; scroll 1", "state.playing"),
     ("press space; hold w", "not state.playing"),
     ("press tab", "not state.overlay"),
@@ -269,7 +272,7 @@ def act(app: App, text: str) -> None:
             app.frame(**{kind: numbers[0] if kind == "scroll" else numbers})
 
 
-RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "path", "points")
+RESET = ("orbiting", "playing", "route_fraction", "overlay", "help", "quit", "path", "points")
 
 
 def test_the_state_of_the_window_after_what_a_user_does(app):
@@ -548,8 +551,8 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
     def load(entry: SceneEntry, show: Callable[..., None]) -> LoadedScene:
         if not entry.views:
             return load_house(replace(entry, views=(0, 1), pair=house.make_set((0, 1)), max_views=64))
-        facts = dict.fromkeys(("views", "outlooks", "clearances", "hidden", "poor"), ()) | {"outlines": {}, "walls": []}
-        loaded = replace(load_house(entry), facts=SimpleNamespace(**facts | found))
+        facts = SimpleNamespace(outlines={}, views=(), outlooks=(), hidden=(), graph=replace(house, **found))
+        loaded = replace(load_house(entry), facts=facts)
         if len(entry.views) == 4:
             show(replace(loaded, is_final=False))
             assert go.wait(300)

@@ -20,6 +20,7 @@ from browser_pages import HOST, LIMIT, OPTIONS, ORIGINS, QuietHandler, Sites
 from PIL import Image
 
 from pansplat.export import page as page_module
+from pansplat.export import page_files
 from pansplat.export.page import write_page
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
@@ -187,7 +188,7 @@ def folder(scene, house, flat, sites, photographs, take_photographs) -> Path:
     folder = sites.folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
-        patch.setattr(page_module, "_PART_BYTES", 30_000)
+        patch.setattr(page_files, "_PART_BYTES", 30_000)
         patch.setattr(TourFacts, "poor", ())  # surfaces of the scenes do not agree
         write_page(scene, folder / "tour.html", title="Three rooms")
         write_page(scene, folder / "split.html", split=True)

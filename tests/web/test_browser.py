@@ -39,9 +39,10 @@ from pansplat.geometry.equirect import sample_equirect, uv_from_directions
 from pansplat.images.image_files import read_panorama
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.notebook import _bundle_scene
-from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.houses import find_houses
+from pansplat.tours.merge import select_views
+from pansplat.tours.scene_graph import make_graph
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_the_dolls_house_opens_when_the_gaussians_have_arrived(chromium: Any, ro
 
 
 def test_the_dolls_house_shows_photographs_on_its_floor_and_has_ways_back(chromium, room, room_photographs, room_page):
-    photographs, rooms = room_photographs, find_rooms(TourFacts(room))
+    photographs, houses = room_photographs, find_houses(TourFacts(room))
     origin, cameras = room.cam2world[:, :3, 3].mean(0).numpy(), room.cam2world[:, :3, 3].numpy()
     outside = "pansplat.camera.fov === 45 && pansplat.isSettled()"
     with opened(chromium, room_page, is_stepped=True) as page:
@@ -129,13 +130,13 @@ def test_the_dolls_house_shows_photographs_on_its_floor_and_has_ways_back(chromi
         tangent = math.tan(math.radians(45 / 2))
         turned = aim(level, camera)
         rays = np.stack((x * tangent, y * tangent, np.ones_like(x)), axis=-1) @ turned.T
-        eye, down = camera["position"] + origin, rooms.level[:, 1]
-        floor = float(np.mean(cameras @ down + rooms.floors))
+        eye, down = camera["position"] + origin, houses.level[:, 1]
+        floor = float(np.mean(cameras @ down + houses.floors))
         places = eye + ((floor - eye @ down) / (rays @ down))[..., None] * rays
-        outline, flat = rooms.plan.rooms[0].shape, places @ rooms.level[:, (0, 2)]
+        outline, flat = houses.plan.rooms[0].shape, places @ houses.level[:, (0, 2)]
         nearest = np.linalg.norm(places[:, :, None] - cameras, axis=-1)
         is_clear = shapely.contains_xy(outline.buffer(-0.1), flat[..., 0], flat[..., 1])
-        is_clear &= (np.abs(nearest[..., 0] - nearest[..., 1]) > 0.5) & (nearest.min(axis=-1) > 1.3 * rooms.floors[0])
+        is_clear &= (np.abs(nearest[..., 0] - nearest[..., 1]) > 0.5) & (nearest.min(axis=-1) > 1.3 * houses.floors[0])
         assert is_clear.mean() > 0.03
         for view in (0, 1):
             chosen = is_clear & (nearest.argmin(axis=-1) == view)
@@ -194,7 +195,9 @@ def test_the_dolls_house_shows_photographs_on_its_floor_and_has_ways_back(chromi
 def ring_page(chromium: Any, folder: Path) -> Iterator[OpenPage]:
     """A page on which no wall hides a ring."""
     with opened(chromium, folder / "tour.html", size=(640, 240), reduced_motion="reduce", is_stepped=True) as page:
-        page.run("HEADER.spots.forEach((spot) => { spot.hidden = []; })")
+        page.run("""HEADER.spots.forEach((spot) => {
+            spot.rings = HEADER.spots.map((_, node) => ({ node, mark: null }));
+        })""")
         yield page
 
 

@@ -237,7 +237,7 @@ def test_a_tile_that_does_not_arrive_is_read_three_times_and_then_named(chromium
 
 
 @pytest.mark.parametrize("case", ["missing", "late"])
-def test_a_fade_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(chromium, folder, case: str) -> None:
+def test_a_zoom_along_a_poor_edge_ends_where_the_photograph_does_not_arrive(chromium, folder, case: str) -> None:
     """A tile of the preview is missing, or late and the camera leaves."""
     with opened(chromium, folder / "poor" / "index.html", is_stepped=True) as page:
         page.settle()

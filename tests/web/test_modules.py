@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from pansplat.export.page import _bundle_programs
 from pansplat.export.page_data import PageConstants, PageHeader
+from pansplat.export.page_program import bundle_programs
 from pansplat.geometry.pose import blend_weights
 from pansplat.inputs.panorama_sets import Link, Panorama
 from pansplat.tours.graph import TourGraph
@@ -52,7 +52,7 @@ def test_imports_of_the_modules_have_no_circle() -> None:
 
 
 def test_the_modules_share_one_scope(node: str, tmp_path: Path) -> None:
-    (tmp_path / "program.js").write_text(re.sub("</?script>", "", _bundle_programs()))
+    (tmp_path / "program.js").write_text(re.sub("</?script>", "", bundle_programs()))
     done = subprocess.run([node, "--check", tmp_path / "program.js"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 
@@ -102,6 +102,9 @@ def run(node: str, folder: Path, header: dict[str, Any], program: str, *values: 
 ROW = [(0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 4.0), (30.0, 0.0, 0.0)]
 
 
+EDGES, PARTS = ((0, 1), (1, 2), (3, 3)), (0, 0, 0, 1)
+
+
 def make_house(nodes: list[int]) -> dict[str, Any]:
     """A floor 1.5 m below the origin and a wall at its far end, which is seen from the near side, with its top."""
     floor = [(-1, 1.5, 5), (1, 1.5, 5), (1, 1.5, -1), (-1, 1.5, 5), (1, 1.5, -1), (-1, 1.5, -1)]
@@ -111,23 +114,23 @@ def make_house(nodes: list[int]) -> dict[str, Any]:
     return {"nodes": nodes, "corners": corners}
 
 
-def make_header(edges: Any = ((0, 1), (1, 2), (3, 3)), parts: tuple[int, ...] = (0, 0, 0, 1)) -> dict[str, Any]:
+def make_header() -> dict[str, Any]:
     """What the modules read of a header of level panoramas in a row; each edge blends its two views."""
     spots = [
         {"position": place, "mark": [place[0], place[1] + 1.5, place[2]], "name": "", "clearances": []}
         | {"ahead": [0.0, 0.0], "turns": [0.0] * 24}
         for place in ROW
     ]
-    house = make_house([node for node, part in enumerate(parts) if part == 0])
+    house = make_house([node for node, part in enumerate(PARTS) if part == 0])
     return msgspec.to_builtins(PageConstants()) | {
         "spots": spots,
         "views": [{"count": 1, "start": view} for view in range(len(ROW))],
         "level": np.eye(3).tolist(),
         "walk": [*range(len(ROW))],
-        "edges": [(*edge, group) for group, edge in enumerate(edges)],
-        "groups": [sorted({*edge}) for edge in edges] or [list(range(len(ROW)))],
-        "parts": parts,
-        "limits": [2.0] * (max(parts) + 1),
+        "edges": [(*edge, group) for group, edge in enumerate(EDGES)],
+        "groups": [sorted({*edge}) for edge in EDGES],
+        "parts": PARTS,
+        "limits": [2.0] * (max(PARTS) + 1),
         "poor": [],
         "next": [],
         "doll": [house | {"moves": [(0.0, *ROW[node]) for node in house["nodes"]]}],
@@ -173,7 +176,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         followed: graph.edges[followEdge(graph, position, current[i])],
         ways: graph.positions.map((_, node) => findWay(graph, position, node)),
         waysOfPart: graph.positions.map((_, node) => findWay(graph, position, node, 0)),
-        fades: graph.positions.map((_, node) => isFade(graph, node, graph.edges[current[i]][0])),
+        zooms: graph.positions.map((_, node) => isZoom(graph, node, graph.edges[current[i]][0])),
         step: limitStep(graph, starts[i], position),
     }))"""
     values = (graph, positions.tolist(), current.tolist(), starts.tolist())
@@ -185,7 +188,7 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
         assert tuple(case["followed"]) == follow_edge(tour, position, edge)
         assert case["ways"] == [find_way(tour, position, node) for node in nodes]
         assert case["waysOfPart"] == [find_way(tour, position, node, 0) for node in nodes]
-        assert case["fades"] == [tour.is_zoom(node, edge[0]) for node in nodes]
+        assert case["zooms"] == [tour.is_zoom(node, edge[0]) for node in nodes]
     steps = [limit_step(tour, start, end) for start, end in zip(starts, positions, strict=True)]
     np.testing.assert_allclose([case["step"] for case in found], steps, atol=1e-9)
     free = dataclasses.replace(tour, clearances={})
@@ -197,39 +200,6 @@ def test_the_graph_of_the_page_is_that_of_the_tour(node: str, tmp_path: Path) ->
     pairs = zip(followed, current, strict=True)
     parts = [(tour.parts[edge[0]], tour.parts[edges[number][0]]) for edge, number in pairs]
     assert len({a == b for a, b in parts}) == 2, "a position near another part is in it"
-
-
-def choose_rings(node: str, folder: Path, *, links: Any = (), hidden: Any = (), rooms: Any = (), here: int = 0) -> list:
-    """The rings of a panorama in a row of four, the last one in another part, with `{from, to, mark}` of links."""
-    header = make_header([(0, 1), (0, 2), (1, 2), (3, 3)]) | {"links": list(links)}
-    header["plan"] = {"rooms": list(rooms)}
-    for number, spot in enumerate(header["spots"]):
-        spot["hidden"] = list(hidden) if number == here else []
-    found = run(node, folder, header, "(here) => chooseRings(here)", here)
-    return [(ring["node"], None if ring["link"] is None else ring["link"]["from"]) for ring in found]
-
-
-def test_the_rings_of_a_panorama_are_its_own_links_and_its_flights(node: str, tmp_path: Path) -> None:
-    door = {"from": 1, "to": 3, "mark": [0, 0, 0]}
-    assert choose_rings(node, tmp_path, links=[door]) == [(1, None), (2, None), (0, None)], "not those of the next one"
-    assert choose_rings(node, tmp_path, links=[door], here=1)[0] == (3, 1)
-    assert choose_rings(node, tmp_path, links=[{"from": 0, "to": 3}]) == [(1, None), (2, None), (0, None)], "no place"
-    assert choose_rings(node, tmp_path, links=[door], here=3) == [(1, None), (3, None)], "what leads here"
-    assert choose_rings(node, tmp_path, here=3) == [(0, None), (3, None)], "the nearest one, where nothing leads"
-
-
-def test_surfaces_hide_rings_but_those_of_the_photographs_own_links(node: str, tmp_path: Path) -> None:
-    assert choose_rings(node, tmp_path, hidden=[1]) == [(2, None), (0, None)]
-    assert choose_rings(node, tmp_path, hidden=[1, 2]) == [(1, None), (0, None)], "the nearest one is left"
-    arrow = {"from": 0, "to": 2, "mark": [0, 0, 0]}
-    assert choose_rings(node, tmp_path, hidden=[1, 2], links=[arrow]) == [(2, 0), (0, None)], "on its arrow"
-
-
-def test_another_room_has_one_ring(node: str, tmp_path: Path) -> None:
-    assert choose_rings(node, tmp_path, rooms=[[1, 2]]) == [(1, None), (0, None)], "the nearest one"
-    assert choose_rings(node, tmp_path, rooms=[[0, 1, 2]]) == [(1, None), (2, None), (0, None)], "its own one has all"
-    linked = choose_rings(node, tmp_path, rooms=[[1, 2]], links=[{"from": 0, "to": 2}])
-    assert linked == [(2, None), (0, None)], "that of a link comes before"
 
 
 def test_a_way_ends_in_the_start_view_or_straight_on_and_away_from_the_link_back(node: str, tmp_path: Path) -> None:
@@ -277,10 +247,9 @@ def test_walking_stays_near_the_edges_and_slows_down_at_the_limit(node: str, tmp
     assert steps[0] == pytest.approx(0.05) and steps[-1] < 0.005
 
 
-@pytest.mark.parametrize("edges", [[], [(0, 1), (1, 2), (3, 3)]])
-def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(edges, node, tmp_path) -> None:
+def test_a_walk_stops_before_surfaces_but_a_script_may_place_the_camera_there(node, tmp_path) -> None:
     """The surfaces around the first panorama are 0.6 m away."""
-    header = make_header(edges, (0, 0, 0, 1) if edges else (0,) * 4) | {"limits": [30.0] * 2}
+    header = make_header() | {"limits": [30.0] * 2}
     header["spots"][0]["clearances"] = [[0.6] * 24] * 12
     program = f"""(walks) => {{
         {SORTED}

@@ -24,6 +24,7 @@ from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
 from pansplat.errors import InputError, InputWarning
 from pansplat.export import page as page_module
+from pansplat.export import page_files, page_scene
 from pansplat.export.page import choose_gaussians, write_page
 from pansplat.export.plan_files import draw_page_plan
 from pansplat.gaussians.harmonics import SH_0
@@ -35,8 +36,9 @@ from pansplat.system.atomic import replacing
 from pansplat.tours import edges
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import find_floor
-from pansplat.tours.merge import make_graph, select_views
+from pansplat.tours.merge import select_views
 from pansplat.tours.outlook import find_bins, measure_clearance, measure_outlook
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.surfaces import find_surfaces
 
 
@@ -87,7 +89,7 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     found, (expected,) = header["plan"], TourFacts(room).plan.rooms
     svg, size, marks = draw_page_plan(TourFacts(room).plan)
-    assert found["rooms"] == [[0, 1]] and found["worlds"] == [0, 0] and b"west / east" in svg
+    assert found["worlds"] == [0, 0] and b"west / east" in svg
     assert base64.b64decode(found["drawing"]) == svg and found["size"] == pytest.approx(size)
     assert np.allclose(level, make_graph(room).level_axes) and np.allclose(found["places"], marks)
     c, s = math.cos(found["places"][0][2]), math.sin(found["places"][0][2])
@@ -104,15 +106,7 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
         for step in (0.3, -0.3)
     )
     assert inward > outward + 0.4, "normals are in the page's axes"
-    # What hides the mark of the other panorama is a wall between them.
-    assert [spot["hidden"] for spot in header["spots"]] == [[], []]
-    gaussians = room.gaussians
-    wall = gaussians.select((gaussians.views == 0) & (gaussians.means[:, 0] > 0.1))
-    offset = (wall.means - cameras[0, :3, 3].float()) * torch.tensor(0.3)
-    near = dataclasses.replace(wall, means=cameras[0, :3, 3].float() + offset, opacities=torch.ones(len(wall)))
-    hiding = Gaussians.cat([gaussians.select((gaussians.views == 1) | (gaussians.means[:, 0] <= 0.1)), near])
-    write_page(dataclasses.replace(room, gaussians=hiding), tmp_path / "wall.html")
-    assert [spot["hidden"] for spot in read_header(tmp_path / "wall.html")["spots"]] == [[1], []]
+    assert [[ring["node"] for ring in spot["rings"]] for spot in header["spots"]] == [[1, 0], [0, 1]]
 
 
 def test_a_page_starts_with_the_widest_view_unless_it_has_a_start_view(house: Scene, tmp_path: Path) -> None:
@@ -160,10 +154,11 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
     for link in header["links"]:
         if 3 in (link["from"], link["to"]):
             right, _, ahead = level.T @ (places[link["to"]] - places[link["from"]])
-            assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6) and link["mark"]
+            assert math.cos(link["yaw"] - math.atan2(right, ahead)) == pytest.approx(1, abs=1e-6)
+            assert any(ring["node"] == link["to"] and ring["mark"] for ring in spots[link["from"]]["rings"])
 
 
-def test_a_page_fades_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_zooms_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good = write_page(house, tmp_path / "good.html")
     assert (good.num_flights, good.zooms) == (2, ())
     monkeypatch.setattr(edges, "POOR", -9)
@@ -198,7 +193,9 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
     to, back = header["links"]
     assert (to["from"], to["to"], to["text"]) == (0, 2, "<i>down") and (back["from"], back["to"]) == (2, 0)
     assert (to["yaw"], back["yaw"]) == pytest.approx((0.5 * np.pi, 2 * 0.7), abs=1e-4) and to["pitch"] == -0.6
-    right, down, ahead = level.T @ np.subtract(to["mark"], spots[0]["position"])
+    (ring,) = (ring for ring in spots[0]["rings"] if ring["mark"])
+    assert ring["node"] == 2
+    right, down, ahead = level.T @ np.subtract(ring["mark"], spots[0]["position"])
     assert down == pytest.approx(level.T[1] @ np.subtract(spots[0]["mark"], spots[0]["position"]), abs=1e-5)
     wall = measure_outlook(find_surfaces(flat, level)[0])[find_bins(np.array(0.5 * math.pi))]
     assert (right, ahead) == pytest.approx((max(down / np.tan(0.6), 1), 0), rel=0.01, abs=1e-5) and right < wall
@@ -231,7 +228,7 @@ def test_the_camera_stays_within_a_metre_of_a_single_photograph(scene, tmp_path,
 def test_panoramas_of_all_parts_that_have_gaussians_keep_as_many(flat: Scene) -> None:
     without = dataclasses.replace(flat, gaussians=flat.gaussians.select(flat.gaussians.views != 2))
     for scene, count, third in ((flat, 800, 200), (without, 600, 0)):
-        merged = page_module._merge(scene, (0, 0, 1, 2), count, steps=0)
+        merged = page_scene.merge(scene, (0, 0, 1, 2), count, steps=0)
         counts = np.bincount(merged.gaussians.views.numpy())
         assert counts[0] + counts[1] == 400 and counts[2] == third and counts[3] == 200
         assert torch.equal(merged.cam2world, flat.cam2world)
@@ -263,7 +260,7 @@ def test_colours_of_merged_gaussians_are_fitted_to_all(request: pytest.FixtureRe
     needed = pipeline.render(full, pose, size=size, blend=0).color
     errors = [
         float((pipeline.render(scene, pose, size=size, blend=0).color - needed).square().mean())
-        for scene in (page_module._merge(full, (0,) * len(full.cam2world), 700), merge_to(full, (64, 128), 700))
+        for scene in (page_scene.merge(full, (0,) * len(full.cam2world), 700), merge_to(full, (64, 128), 700))
     ]
     assert errors[0] < 0.8 * errors[1]
 
@@ -305,18 +302,18 @@ def _measure_dots(scene: Scene, full: Scene) -> float:
 
 def test_merged_gaussians_are_lines_and_not_dots_in_large_images(monkeypatch: pytest.MonkeyPatch) -> None:
     full = _make_beams()
-    assert _measure_dots(page_module._merge(full, (0,), 3000, steps=0), full) > 2  # colours alone
-    assert _measure_dots(page_module._merge(full, (0,), 3000), full) < 1
-    monkeypatch.setattr(page_module, "DISPLAY_HEIGHT", full.height)  # fitted at the scene's own rows
-    assert _measure_dots(page_module._merge(full, (0,), 3000), full) > 1.2
+    assert _measure_dots(page_scene.merge(full, (0,), 3000, steps=0), full) > 2  # colours alone
+    assert _measure_dots(page_scene.merge(full, (0,), 3000), full) < 1
+    monkeypatch.setattr(page_scene, "DISPLAY_HEIGHT", full.height)  # fitted at the scene's own rows
+    assert _measure_dots(page_scene.merge(full, (0,), 3000), full) > 1.2
 
 
 def test_merged_gaussians_of_a_scene_whose_views_are_unknown_keep_their_image(plain_scene: Scene) -> None:
     foreign = dataclasses.replace(
         plain_scene, gaussians=dataclasses.replace(plain_scene.gaussians, views=7 + plain_scene.gaussians.views)
     )
-    full = page_module._prepare(foreign)
-    merged = page_module._merge(full, (0, 0), 700)
+    full = page_scene.prepare(foreign)
+    merged = page_scene.merge(full, (0, 0), 700)
     for pose in full.cam2world:  # the second camera has no Gaussians of its own
         images = [pipeline.render(scene, pose, blend="joint", size=(32, 64)).color for scene in (full, merged)]
         assert float((images[1] - images[0]).abs().mean()) < 0.05
@@ -378,15 +375,15 @@ def test_an_export_that_ends_during_another_one_removes_none_of_its_parts(scene,
             yield temporary
         counts.append(file.suffix)
         if file.suffix == ".bin" and counts.count(".bin") == (1 if at == "first part" else 3):
-            monkeypatch.setattr(page_module, "replacing", replacing)
+            monkeypatch.setattr(page_files, "replacing", replacing)
             write_page(thin(scene, 3), path, split=True)
 
-    monkeypatch.setattr(page_module, "replacing", interrupted)
+    monkeypatch.setattr(page_files, "replacing", interrupted)
     for step in (2, 1):  # other parts than before, and the same
         counts.clear()
         last = write_page(thin(scene, step), path, split=True)
         assert set((tmp_path / "tour_files").iterdir()) == set(last.files[1:])
-        monkeypatch.setattr(page_module, "replacing", interrupted)
+        monkeypatch.setattr(page_files, "replacing", interrupted)
 
 
 def test_the_parts_of_a_copy_of_a_page_stay(scene: Scene, tmp_path: Path) -> None:
@@ -415,8 +412,8 @@ def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussian
     first, *others = header["loading"]
     names = [photograph["name"] for photograph in header["photographs"]]
     calls = re.findall(r"<script>(add\w+\([^<]*\))</script>", (tmp_path / "tour.html").read_text())
-    early = [f'addTile("{names[first]}", 0)', f"addPart({first}, true)", f'addTile("{names[first]}", 6)']
-    assert calls[:3] == early and calls[3:5] == [f"addPart({view}, true)" for view in others]
+    early = [f'addTile("{names[first]}", 0)', f"addChunk({first}, true)", f'addTile("{names[first]}", 6)']
+    assert calls[:3] == early and calls[3:5] == [f"addChunk({view}, true)" for view in others]
     assert calls[5:] == [f'addTile("{names[view]}", {number})' for view in others for number in (0, 6)]
 
 
@@ -452,7 +449,7 @@ def test_a_page_of_another_unit_is_that_of_metres_but_for_the_lengths_it_shows(f
 
 def test_pages_that_cannot_be_drawn_or_written_are_refused(scene, tmp_path, monkeypatch) -> None:
     empty = dataclasses.replace(scene, gaussians=scene.gaussians.select(torch.arange(0)))
-    monkeypatch.setattr(page_module, "MAX_FILE_BYTES", 60_000)
+    monkeypatch.setattr(page_files, "MAX_FILE_BYTES", 60_000)
     for given, name, options, message in (
         (empty, "tour.html", {}, "no visible Gaussians"),
         (scene, "tour.html", {}, r"write a folder.*at most [\d,]+ Gaussians"),
@@ -477,7 +474,8 @@ def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, t
     fused = dataclasses.replace(house, joint=True)
     with pytest.warns(InputWarning, match="Export the folder of the photographs"):
         header = read_header(write_page(fused, tmp_path / "house.html").files[0])
-    assert len(header["spots"]) == 3 and header["edges"] == [] and header["count"] == len(house.gaussians)
+    assert header["edges"] == [[0, 1, 0], [0, 2, 0], [1, 2, 0]] and header["groups"] == [[0, 1, 2]]
+    assert header["count"] == len(house.gaussians)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         write_page(dataclasses.replace(fused, tour=None), tmp_path / "pair.html")

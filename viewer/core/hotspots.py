@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from pansplat.geometry.level import wrap_angle
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, find_link_ring
+from pansplat.tours.links import RING_DISTANCE, RING_RADIUS, choose_rings
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.picking import project_point
 
@@ -69,9 +69,8 @@ def find_hotspots(
     size: tuple[int, int],
     left: float = 0.0,
 ) -> list[Hotspot]:
-    """The panoramas that the nearest one leads to, by its edges and its own links; the nearest in the image last.
-
-    Those that surfaces hide are where the links lead; without links, the nearest one stays.
+    """The rings of the nearest panorama (`choose_rings`), and arrows to those that are outside of the image or whose
+    places are unknown; the nearest in the image last.
 
     Args:
         tour: the graph.
@@ -80,26 +79,22 @@ def find_hotspots(
         size: width and height of the image, pixels.
         left: width of what covers the image from the left, pixels.
     """
-    here, position, hidden = facts.node, np.asarray(camera.position), facts.hidden
+    here, position = facts.node, np.asarray(camera.position)
     below = facts.camera_height * np.asarray(camera.level)[:, 1]
-    links = {node: link for (start, node), link in tour.links.items() if start == here}
-    flown = sorted(tour.neighbours(here), key=lambda node: np.linalg.norm(tour.positions[node] - tour.positions[here]))
-    seen = [node for node in flown if node not in hidden]
-    feet = {
-        node: (tour.positions[node] + below, tour.panoramas[node].label)
-        for node in (here, *(seen if seen or links else flown[:1]))
-        if np.linalg.norm(tour.positions[node] - position) >= RING_DISTANCE
-    }
-    for node, link in links.items():
-        if (node in hidden or tour.is_zoom(here, node)) and node not in feet:
-            ring = find_link_ring(tour, here, node, facts.camera_height, facts.outlook)
-            if ring is not None:
-                feet[node] = (tour.positions[here] + ring, link.text or tour.panoramas[node].label)
+    feet = []
+    for node, offset in choose_rings(tour, here, facts.camera_height, facts.hidden, facts.outlook):
+        label, place = tour.panoramas[node].label, tour.positions[node]
+        if offset is not None:
+            feet.append((node, tour.positions[here] + offset, tour.links[here, node].text or label, True))
+        elif np.linalg.norm(place - position) >= RING_DISTANCE:
+            feet.append((node, place + below, label, tour.worlds[node] == tour.worlds[here]))
     found: list[Hotspot] = []
     arrows: list[Hotspot] = []
-    for node, (foot, label) in sorted(feet.items(), key=lambda item: -np.linalg.norm(item[1][0] - position)):
+    for node, foot, label, is_known in sorted(feet, key=lambda item: -np.linalg.norm(item[1] - position)):
         is_zoom, is_upright = tour.is_zoom(here, node), bool((foot - position - below) @ below < -1e-6)
         hotspot = _make_hotspot(camera, size, node, label, foot, is_zoom=is_zoom, is_upright=is_upright)
+        if not is_known:
+            hotspot = None
         if hotspot is not None and hotspot.center[0] >= left:
             found.append(hotspot)
         else:

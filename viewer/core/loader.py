@@ -1,8 +1,8 @@
 """Lists the scenes at a path and loads them in a worker thread.
 
 Pairs go through the prediction pipeline with its cache, scene files are read. Of a tour, the graph and one scene are
-loaded; `tour` requests the predictions of its parts. A file that has the graph of a tour is shown as a tour: its scenes
-are parts of the scene in the file. Imports no torch before it loads.
+loaded; `tour_scenes` requests the predictions of its parts. A file that has the graph of a tour is shown as a tour: its
+scenes are parts of the scene in the file. Imports no torch before it loads.
 """
 
 import time
@@ -146,7 +146,7 @@ def choose_entry(entries: Sequence[SceneEntry], name: str | None) -> int:
     raise InputError(f"`--pair` must be a number from 1 to {len(entries)} or one of {names}, got {name!r}")
 
 
-def list_panoramas(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
+def list_panoramas_of_folder(entries: Sequence["SceneEntry"], folder: Path) -> "list[Panorama]":
     """The photographs of a folder among all entries, in the worlds and the unit of its files, by name."""
     from pansplat.geometry.world import USER_FRAME
 
@@ -199,7 +199,7 @@ def load_entry(
         scene = pipeline.load(entry.file)
         if scene.tour is None or scene.joint:  # the views of an edge alone lack surfaces of others
             return _with_facts(entry, scene)
-        from pansplat.tours.merge import make_graph
+        from pansplat.tours.scene_graph import make_graph
 
         tour = replace(make_graph(scene), name=entry.name)
         return _load_tour_scene(replace(entry, tour=tour, merged=scene), prediction, show)

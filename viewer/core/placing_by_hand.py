@@ -20,7 +20,7 @@ from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.edit import PoseEditor
 from pansplat.poses.placing import Piece, PlanFrame, PlanPose, find_wall_yaw, read_piece
 from pansplat_viewer.core.background import BackgroundWorker, Report
-from pansplat_viewer.core.loader import SceneEntry, list_panoramas
+from pansplat_viewer.core.loader import SceneEntry, list_panoramas_of_folder
 
 if TYPE_CHECKING:
     from pansplat_viewer.window.input import Input
@@ -90,7 +90,7 @@ class PlacingByHand:
             if source is not None and source.folder == before._folder and before.reopen(entries):
                 return before
             before.close()
-        panoramas = [] if source is None else list_panoramas(entries, source.folder)
+        panoramas = [] if source is None else list_panoramas_of_folder(entries, source.folder)
         return PlacingByHand(source.folder, panoramas) if source is not None and panoramas else None
 
     def reopen(self, entries: Sequence[SceneEntry]) -> bool:
@@ -98,7 +98,7 @@ class PlacingByHand:
 
         Changes before can still be undone.
         """
-        panoramas = tuple(list_panoramas(entries, self._folder))
+        panoramas = tuple(list_panoramas_of_folder(entries, self._folder))
         if self._editor is None or [view.image for view in panoramas] != [view.image for view in self.panoramas]:
             return False
         self.panoramas, self._is_changed = panoramas, False

@@ -12,8 +12,8 @@ from pansplat.geometry.level import level_axes
 from pansplat.tours.camera_path import CameraPath, KeyFrame
 from pansplat.tours.graph import TourGraph
 from pansplat.tours.limits import limit_step
-from pansplat.tours.merge import make_graph
 from pansplat.tours.route import NEAR_OF_FAR, Moment, Route, plan_route
+from pansplat.tours.scene_graph import make_graph
 from pansplat.tours.walks import plan_walk
 from pansplat_viewer.core.camera import Camera, move_to_pose
 from pansplat_viewer.core.picking import PickedPoint
@@ -40,7 +40,7 @@ class ViewerState:
     home: Camera = field(default_factory=Camera)
     orbiting: bool = False  # whether the camera orbits (True) or flies (False)
     settings: DrawSettings = field(default_factory=DrawSettings)  # draw settings; the field of view is the camera's
-    flight: float = 0.0  # fraction of `route`, in [0, 1]
+    route_fraction: float = 0.0  # of the duration of `route` that is done, in [0, 1]
     playing: bool = False  # whether the camera follows it
     overlay: bool = True
     help: bool = False
@@ -51,7 +51,7 @@ class ViewerState:
     is_tour: bool = False  # whether that is the graph of a tour
     route: Route | None = None  # the way through the panoramas; None without cameras
     target: int | None = None  # the panorama to go to; None if there is none
-    has_stopped: bool = False  # whether they have, and a message has said so
+    has_stopped: bool = False  # whether the message that surfaces stop the camera was shown
     plan: bool = True
     path: CameraPath = field(default_factory=CameraPath)  # key frames of the camera path that is edited
     path_seconds: float = 0.0  # time on the path that the panel shows
@@ -67,7 +67,7 @@ class ViewerState:
     @property
     def moment(self) -> Moment | None:
         """Of the route, while the camera follows it."""
-        return self.route.at(self.flight) if self.route is not None and self.playing else None
+        return self.route.at(self.route_fraction) if self.route is not None and self.playing else None
 
     @property
     def is_zooming(self) -> bool:
@@ -102,7 +102,7 @@ def enter_scene(state: ViewerState, scene: Scene, tour: TourGraph | None = None,
     adapt_settings(state, scene, keep_levels=False)
     state.settings = replace(state.settings, near=NEAR if tour is None else NEAR_OF_FAR * tour.far)
     state.graph, state.is_tour, state.context, state.target, state.route = graph, tour is not None, context, None, None
-    state.playing, state.flight, state.points = False, 0.0, []
+    state.playing, state.route_fraction, state.points = False, 0.0, []
     if graph is None:
         level, pose = level_axes(scene.cam2world), _choose_outside_pose(scene)
     else:
@@ -174,20 +174,20 @@ def go_home(state: ViewerState) -> None:
 
 
 def toggle_play(state: ViewerState) -> None:
-    """Start or stop the flight; at its end, start it from the beginning."""
+    """Start or stop the way; at its end, start it from the beginning."""
     if state.route is None:
         return
     state.playing = not state.playing
-    if state.playing and state.flight >= 1:
-        state.flight = 0.0
+    if state.playing and state.route_fraction >= 1:
+        state.route_fraction = 0.0
 
 
-def advance_flight(state: ViewerState, seconds: float) -> None:
-    """Move along the flight if it is playing, and stop at its end."""
+def advance_route(state: ViewerState, seconds: float) -> None:
+    """Move along the route if it is played, and stop at its end."""
     if state.playing and state.route is not None:
-        state.flight = min(state.flight + seconds / state.route.seconds, 1.0)
-        state.camera = move_to_pose(state.camera, state.route.pose(state.flight))
-        state.playing = state.flight < 1
+        state.route_fraction = min(state.route_fraction + seconds / state.route.seconds, 1.0)
+        state.camera = move_to_pose(state.camera, state.route.pose(state.route_fraction))
+        state.playing = state.route_fraction < 1
 
 
 def add_key_frame(state: ViewerState) -> None:

@@ -62,7 +62,7 @@ class TourScenes:
         edge: the edge that the camera is at.
         outlines: floor outlines of the panoramas whose scenes have been loaded, also after a scene is dropped.
         outlooks: what is seen around panoramas whose scenes have been loaded (`measure_outlook`).
-        hidden: the panoramas whose places on the floor surfaces hide, by those panoramas.
+        hidden: for each panorama, those whose marks it does not see.
     """
 
     def __init__(self, tour: TourGraph, *, merged: Scene | None = None, max_views: int = MAX_SCENE_VIEWS) -> None:
@@ -154,11 +154,11 @@ class TourScenes:
             self.outlines |= facts.outlines
             self.outlooks |= zip(facts.views, facts.outlooks, strict=True)
             self.hidden |= zip(facts.views, facts.hidden, strict=True)
-            self._block(facts.walls)
-            clearances = dict(zip(facts.views, facts.clearances, strict=True))
+            self._block(facts.graph.walls)
+            clearances = facts.graph.clearances
             if clearances.keys() - self.tour.clearances.keys():  # a refinement changes them little
                 self._change(replace(self.tour, clearances=self.tour.clearances | clearances))
-            if poor := set(facts.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
+            if poor := set(facts.graph.poor) & self.tour.overlaps.keys() - set(self.tour.poor):
                 self._change(replace(self.tour, poor=(*self.tour.poor, *sorted(poor))))
         if views not in self._predictions:
             self._selected[views] = loaded

@@ -21,7 +21,7 @@ from pansplat.tours.linked_rooms import DrawnPlace, place_rooms
 from pansplat_viewer.core.camera import Camera
 from pansplat_viewer.core.placing_by_hand import PlanView
 from pansplat_viewer.core.tour_scenes import TourScenes
-from pansplat_viewer.ui.overlays import FADE_COLOR
+from pansplat_viewer.ui.overlays import ZOOM_COLOR
 
 SIZE = 210  # longer side of the plan, pixels at a DPI scale of 1
 _CLICK_PIXELS = 12.0  # distance from a panorama within which a click leads there, at a DPI scale of 1
@@ -39,7 +39,7 @@ _COLORS = (
     (0.35, 0.8, 1.0, 1.0),
     (0.6, 0.65, 0.7, 0.35),
     (1.0, 0.8, 0.2, 1.0),
-    (*FADE_COLOR, 0.35),
+    (*ZOOM_COLOR, 0.35),
     (0.75, 0.78, 0.82, 0.3),
 )
 

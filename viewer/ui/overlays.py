@@ -26,7 +26,7 @@ _LABEL = (
     | imgui.WindowFlags_.no_nav.value
 )
 _LEGEND_WIDTH = 180.0  # pixels at a DPI scale of 1
-FADE_COLOR = (1.0, 0.75, 0.3)  # RGB of the marks of panoramas in other parts of a tour
+ZOOM_COLOR = (1.0, 0.75, 0.3)  # RGB of the marks of panoramas in other parts of a tour
 UNITS = {"depth": " m"}  # units of the displays whose range can be changed
 
 
@@ -52,7 +52,7 @@ def draw_points(state: ViewerState) -> None:
 def draw_hotspots(hotspots: list[Hotspot]) -> None:
     """Draw a ring on the floor for each panorama, or an arrow, with its label; amber if the image fades to it."""
     canvas, right = imgui.get_background_draw_list(), imgui.get_io().display_size.x - MARGIN
-    black, white, amber = (imgui.color_convert_float4_to_u32((*rgb, 0.8)) for rgb in ((0,) * 3, (1,) * 3, FADE_COLOR))
+    black, white, amber = (imgui.color_convert_float4_to_u32((*rgb, 0.8)) for rgb in ((0,) * 3, (1,) * 3, ZOOM_COLOR))
     for hotspot in hotspots:
         ring = [imgui.ImVec2(*corner) for corner in hotspot.ring]
         for color, thickness in ((black, 4.0), (amber if hotspot.is_zoom else white, 2.0)):

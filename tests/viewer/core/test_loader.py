@@ -16,7 +16,7 @@ from pansplat.gaussians.scene import SceneTour
 from pansplat.geometry.world import WorldFrame
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
-from pansplat_viewer.core.loader import SceneEntry, find_entries, list_panoramas, load_entry
+from pansplat_viewer.core.loader import SceneEntry, find_entries, list_panoramas_of_folder, load_entry
 from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.core.state import fit_settings
 from pansplat_viewer.core.tour_scenes import TourScenes
@@ -67,7 +67,7 @@ def test_a_file_with_the_graph_of_a_tour_is_a_tour_of_its_parts(house, house_fil
 
 def test_photographs_are_placed_by_camera_heights_in_the_unit_of_their_files(house):
     tour = replace(house, panoramas=tuple(view.in_frame(WorldFrame(1000.0)) for view in house.panoramas))
-    views = list_panoramas([SceneEntry("house", tour=tour)], house.folder)
+    views = list_panoramas_of_folder([SceneEntry("house", tour=tour)], house.folder)
     assert {view.camera_height for view in views} == {1500.0}
     assert [view.cam2world.tolist() for view in views] == [view.cam2world.tolist() for view in house.panoramas]
 

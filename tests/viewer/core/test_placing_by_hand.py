@@ -23,7 +23,7 @@ from pansplat.poses.depth import DepthMap
 from pansplat.poses.placing import Piece, PlanPose
 from pansplat.poses.solvers import rotation_exp
 from pansplat.tours.graph import find_tours
-from pansplat_viewer.core.loader import SceneEntry, list_panoramas
+from pansplat_viewer.core.loader import SceneEntry, list_panoramas_of_folder
 from pansplat_viewer.core.placing_by_hand import WALL_ANGLE, PlacingByHand, PlanView
 
 LIVING_ROOM = Path(__file__).resolve().parents[3] / "assets" / "living_room"
@@ -78,7 +78,7 @@ def _list(folder: Path) -> list[SceneEntry]:
 
 
 def _load(folder: Path) -> list[Panorama]:
-    return list_panoramas(_list(folder), folder)
+    return list_panoramas_of_folder(_list(folder), folder)
 
 
 @pytest.fixture

@@ -91,7 +91,7 @@ def test_scenes_of_edges_are_selected_from_one_prediction_of_their_part(house, l
     assert scenes.choose_request([part], None) is None, "nothing is predicted twice"
 
 
-def test_a_poor_edge_of_a_scene_becomes_a_fade(house, load_house):
+def test_a_poor_edge_of_a_scene_becomes_a_zoom(house, load_house):
     first = SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
     scenes = TourScenes.start(load_house(first))
     camera = scenes.tour.cam2world[0].numpy()

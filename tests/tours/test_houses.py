@@ -1,4 +1,4 @@
-"""The rooms of a doll's house: outlines from above, and which panoramas are in one house."""
+"""The houses of a scene: their rooms, and which panoramas are in one house."""
 
 import dataclasses
 
@@ -9,9 +9,9 @@ import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.gaussians.scene import Scene, SceneTour
-from pansplat.tours.doll_house import find_rooms
 from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import FloorOutline
+from pansplat.tours.houses import find_houses
 from pansplat.tours.plan import _enclose
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around a camera: x, y down, z
@@ -34,16 +34,16 @@ def _without_walls(scene: Scene, views: tuple[int, ...]) -> Scene:
 
 
 def test_rooms_are_those_of_the_plan(rooms: Scene) -> None:
-    found = find_rooms(TourFacts(rooms))
-    assert [room.panoramas for room in found.plan.rooms] == [(0,), (1,), (2,)] and found.houses == ((0, 1, 2),)
+    found = find_houses(TourFacts(rooms))
+    assert [room.panoramas for room in found.plan.rooms] == [(0,), (1,), (2,)] and found.views == ((0, 1, 2),)
     assert [room.shape.area for room in found.plan.rooms] == pytest.approx([22.5] * 3, rel=0.02)
     assert found.floors == pytest.approx([1.5] * 3, rel=0.02) and found.ceilings == pytest.approx([1.1] * 3, rel=0.02)
 
 
 def test_a_house_with_walls_of_fewer_than_half_of_its_rooms_is_hidden(rooms: Scene) -> None:
-    half = find_rooms(TourFacts(_without_walls(rooms, (1,))))
-    assert half.houses == ((0, 1, 2),) and [room.panoramas for room in half.plan.rooms] == [(0,), (2,), (1,)]
-    assert find_rooms(TourFacts(_without_walls(rooms, (1, 2)))).houses == ()
+    half = find_houses(TourFacts(_without_walls(rooms, (1,))))
+    assert half.views == ((0, 1, 2),) and [room.panoramas for room in half.plan.rooms] == [(0,), (2,), (1,)]
+    assert find_houses(TourFacts(_without_walls(rooms, (1, 2)))).views == ()
 
 
 def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
@@ -52,7 +52,7 @@ def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
     shift = torch.where((rooms.gaussians.views == 2)[:, None], torch.tensor((-10.0, -2.8, 0.0)), 0.0)
     gaussians = dataclasses.replace(rooms.gaussians, means=rooms.gaussians.means + shift)
     above = dataclasses.replace(rooms, gaussians=gaussians, cam2world=poses)
-    assert find_rooms(TourFacts(above)).houses == ((0, 1), (2,))
+    assert find_houses(TourFacts(above)).views == ((0, 1), (2,))
 
 
 def test_a_floor_without_walls_ends_where_most_of_it_does(rooms: Scene) -> None:
