@@ -59,13 +59,3 @@ def test_the_quick_run_writes_rows_and_a_plot_and_prints_the_tables(tmp_path, ca
     assert sorted(file.name for file in out.iterdir()) == ["raster.json", "raster.md", "raster.png"]
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("headline", "choices", "PSNR dB"))
-
-
-def test_the_quick_run_is_small(monkeypatch):
-    found = {}
-    monkeypatch.setattr(bench, "_SAMPLE", Path("no such folder"))
-    monkeypatch.setattr(raster, "measure_raster", lambda groups, budget: found.setdefault(budget, groups) and ())
-    for options in (["--quick"], []):
-        assert run(["bench", "raster", *options]) == 0
-    heights = [[max(case.height for case in group.cases) for group in groups] for groups in found.values()]
-    assert heights == [[128, 48], [512, 192]] and list(found) == sorted(found)

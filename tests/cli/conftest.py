@@ -13,8 +13,6 @@ from pansplat.cli import run
 from pansplat.gaussians.scene import Gaussians
 from pansplat.system.progress import report_progress
 
-HEIGHT = 64
-
 
 @pytest.fixture(autouse=True)
 def sphere_model(monkeypatch: pytest.MonkeyPatch, sphere_predictor: type) -> type:
@@ -43,18 +41,8 @@ def predict(room: Path, tmp_path: Path) -> Callable[..., int]:
     """A function that runs `pansplat predict` on the room and returns its status."""
 
     def run_predict(*arguments: str) -> int:
-        start = [
-            "predict",
-            str(room),
-            "-o",
-            str(tmp_path / "scene.ply"),
-            "--model",
-            "sphere",
-            "--layers",
-            "--refine",
-            "0",
-        ]
-        return run([*start, "--height", str(HEIGHT), *arguments])
+        options = ["--model", "sphere", "--layers", "--refine", "0", "--height", "64"]
+        return run(["predict", str(room), "-o", str(tmp_path / "scene.ply"), *options, *arguments])
 
     return run_predict
 

@@ -2,13 +2,11 @@
 
 import contextlib
 import io
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 
 from pansplat.cli import run
 from pansplat.model.pansplat import PanSplat, PanSplatConfig
@@ -19,9 +17,7 @@ from pansplat_viewer.core.loader import find_entries, load_entry
 
 
 @pytest.fixture(scope="module")
-def content(
-    recipe_weights: dict[str, Tensor], as_lightning: Callable[[dict[str, Tensor]], dict[str, object]]
-) -> dict[str, object]:
+def content(recipe_weights, as_lightning) -> dict[str, object]:
     """A checkpoint of the network."""
     return as_lightning(recipe_weights)
 

@@ -17,9 +17,7 @@ def test_info_prints_counts_and_cameras(scene: Path, capsys: pytest.CaptureFixtu
     assert "camera 1" in out and "(1, 0, 0) m" in out and "bounds" in out
 
 
-def test_info_says_what_runs_where(
-    monkeypatch: pytest.MonkeyPatch, refusal, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_says_what_runs_where(monkeypatch, refusal, capsys) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert run(["info", "--device"]) == 0
     assert "can use no graphics card: all work runs on the processor" in capsys.readouterr().out

@@ -20,60 +20,45 @@ from pansplat.system.console import own_warnings
 from pansplat.training.__main__ import run as train
 
 
-def run_program(program: str) -> str:
-    """The output of a Python program, which prints no error."""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_help_does_not_import_torch() -> None:
+def test_help_and_version_are_printed_without_torch() -> None:
     names = ["predict", "render", "refine", "export", "pose", "batch", "evaluate", "check", "info", "convert"]
     names += [f"bench {name}" for name in ("raster", "model", "refine", "viewer", "pose")]
     program = (
-        f"import sys\nfrom pansplat.cli import run\nfor name in ['', 'bench', *{names}]:\n"
-        "    try: run([*name.split(), '--help'])\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
+        "import importlib, sys\nfrom pansplat.cli import run\n"
+        "def end(run, words):\n"
+        "    try: run(words)\n    except SystemExit as stop: assert stop.code == 0, stop.code\n"
+        "    else: sys.exit('no exit')\n"
+        f"for name in ['', 'bench', *{names}]: end(run, [*name.split(), '--help'])\n"
         "heavy = {'torch', 'numpy', 'scipy', 'cv2', 'numba', 'matplotlib'} & set(sys.modules)\n"
-        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+        "assert not heavy, heavy\n"
+        "for name in ('pansplat.cli', 'pansplat_viewer', 'pansplat.training.__main__'):\n"
+        "    end(importlib.import_module(name).run, ['--version'])\n"
+        "assert 'torch' not in sys.modules\n"
     )
-    printed = run_program(program)
-    assert all(f"usage: pansplat {name} " in printed for name in names)
-
-
-@pytest.mark.parametrize(
-    ("module", "name"), [("cli", "pansplat"), ("viewer", "pansplat-view"), ("training", "pansplat-train")]
-)
-def test_the_version_is_printed_without_torch_by_an_installed_command(module: str, name: str) -> None:
-    package = {"cli": "pansplat.cli", "viewer": "pansplat_viewer", "training": "pansplat.training.__main__"}[module]
-    program = f"import sys\nfrom {package} import run\ntry: run(['--version'])\nexcept SystemExit as stop:\n"
-    program += "    assert stop.code == 0 and 'torch' not in sys.modules\nelse: sys.exit('no exit')"
-    assert run_program(program) == f"{name} {pansplat.__version__}\n"
-    (found,) = entry_points(group="console_scripts", name=name)
-    assert callable(found.load())
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert all(f"usage: pansplat {name} " in done.stdout for name in names)
+    commands = ("pansplat", "pansplat-view", "pansplat-train")
+    assert done.stdout.endswith("".join(f"{name} {pansplat.__version__}\n" for name in commands))
+    for name in commands:
+        (found,) = entry_points(group="console_scripts", name=name)
+        assert callable(found.load())
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("pre", {"predict"}),
-        ("predict --mo", {"--model"}),
-        ("bench ra", {"raster"}),
-        ("render scene.ply --layout per", {"perspective"}),
-    ],
-)
-def test_the_completion_script_completes_in_bash(words: str, expected: set[str], capsys, tmp_path: Path) -> None:
+def test_the_completion_script_completes_in_bash(capsys, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         run(["--tyro-print-completion", "bash"])
-    script = tmp_path / "pansplat"
-    script.write_text(capsys.readouterr().out)
-    program = (
-        f"source {script}; COMP_WORDS=(pansplat {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))\n"
-        '_tyro_pansplat; echo "${COMPREPLY[@]}"'
-    )
+    (tmp_path / "pansplat").write_text(capsys.readouterr().out)
+    expected = {"pre": "predict", "predict --mo": "--model", "bench ra": "raster"}
+    expected["render x.ply --layout per"] = "perspective"
+    program = f"source {tmp_path / 'pansplat'}\n"
+    for words in expected:
+        program += f"COMP_WORDS=(pansplat {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); COMPREPLY=()\n"
+        program += '_tyro_pansplat; echo "${COMPREPLY[@]}"\n'
     done = subprocess.run(["bash", "-c", program], capture_output=True, text=True)
     assert stop.value.code in (0, None) and done.stderr == ""
-    assert set(done.stdout.split()) == expected, "and no words of descriptions"
+    assert done.stdout.split("\n")[:-1] == [*expected.values()], "and no words of descriptions"
 
 
 @pytest.mark.parametrize("command", ["render", "export", "predict", "check", "evaluate"])
@@ -89,9 +74,7 @@ def test_help_ends_in_a_narrow_terminal_and_has_plain_headings(command: str, mon
 @pytest.mark.parametrize(
     ("command", "encoding"), [((run, "export"), "utf-8"), ((run, "export"), "ascii"), ((train, "tiny"), "utf-8")]
 )
-def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(
-    command, encoding, monkeypatch
-) -> None:
+def test_help_of_a_long_command_begins_with_what_is_needed_and_names_every_option(command, encoding, monkeypatch):
     """`--help-all` describes each."""
     texts = []
     for option in ("--help", "--help-all"):
@@ -114,10 +97,7 @@ REFUSED = {
     "exprot x": "needed a command, got 'exprot' (did you mean export?); the commands are predict, ",
     "zzz x": "got 'zzz'; the commands are predict, ",
     "info gone.ply": "got no such file; check the path",
-    "info gone.spz": "got no such file; check the path",
-    "render gone.ply -o x.png": "got no such file; check the path",
     "predict room -o scene.obj": "--out must end in .compressed.ply, .spz, .splat, .sog, .glb, .ply",
-    "predict room -o no/x.ply": "existing folder",
     "predict room -o x.ply --model magic": "must be one of default, sphere, sweep",
     "predict room -o x.ply --near 9 --far 3": "0 < near < far",
     "predict room -o x.ply --convention sideways": "needed a known pose convention",
@@ -139,16 +119,11 @@ REFUSED = {
     "render scene.ply -o x.jpg --depth": "--depth writes a .png",
     "render scene.ply -o x.png --blend mixed": "--blend must be",
     "render scene.ply -o x.png --blend view7": "from 0 to 1, got 7",
-    "render scene.ply -o x.png --stereo --layout cubemap": "--stereo is for panoramas of --layout equirect",
-    "render room -o x.png --model sphere --precision bfloat16": "`precision` is for networks",
     "export scene.ply -o x.ply --serve": "--serve is for an .html page, got x.ply",
     "export scene.ply -o x.ply --photo-height 1024": "--photo-height is for an .html page, got x.ply",
     "export room -o x.html --address https://a.b": "--address: needed https://... and a folder",
-    "export room -o x --address a.b": "--address: needed https://... and a folder",
     "export scene.ply -o x.stl": ".sog, .glb, .ply",
     "export scene.ply -o x.spz --points": "--points is for a .ply",
-    "export scene.ply -o x.png --points": "--points is for a .ply",
-    "export room -o x --training-set --points": "--points is for a .ply",
     "export scene.ply -o x.ply --crop a 0 0 1 1 1": "--crop",
     "export scene.ply -o x.ply --layers --crop 50 50 50 60 60 60": "scene.ply: needed a box with Gaussians, got (50.00",
     "export scene.ply -o x --training-set": "needed the folder of the panoramas to write their cube faces",
@@ -157,13 +132,10 @@ REFUSED = {
     "evaluate -o x": "at least one folder",
     "evaluate room -o x --model sphere --lpips vgg": "LPIPS with vgg needed vgg16-397923af",
     "convert path.txt -o x.ckpt": "--out must end in .safetensors",
-    "convert path.txt -o no/x.safetensors": "existing folder",
 }
 
 
-def test_refused_arguments_are_one_line_with_status_2_and_write_nothing(
-    room: Path, scene: Path, tmp_path: Path, refusal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refused_arguments_are_one_line_with_status_2_and_write_nothing(room, scene, tmp_path, refusal, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PANSPLAT_LPIPS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))

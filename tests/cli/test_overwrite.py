@@ -23,14 +23,9 @@ COMMANDS = {
     "scene.ply": ["predict", "{room}", *SPHERE, "--height", "64"],
     "again.ply": ["refine", "{room}", "--model", "sphere", "--height", "64", "--steps", "1"],
     "view.png": ["render", "{scene}", "--height", "16"],
-    "view.jpg": ["render", "{scene}", "--height", "16", "--layout", "perspective"],
     "film.mp4": ["render", "{scene}", "--height", "16", "--seconds", "0.1"],
-    "scene.glb": ["predict", "{room}", *SPHERE, "--height", "64"],
     "scene.spz": ["export", "{scene}"],
-    "scene.sog": ["export", "{scene}"],
-    "scene.compressed.ply": ["export", "{scene}"],
     "points.ply": ["export", "{scene}", "--points"],
-    "page.html": [*EXPORT, "{room}"],
     "plan.png": [*EXPORT, "{room}"],
 }
 
@@ -42,9 +37,7 @@ def write_own(file: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(
-    room: Path, scene: Path, tmp_path: Path, name: str, refusal: Callable[..., str]
-) -> None:
+def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(room, scene, tmp_path, name: str, refusal) -> None:
     file = write_own(tmp_path / "out" / name)
     command = [part.format(room=room, scene=scene) for part in COMMANDS[name]]
     if name == "plan.png":  # the sphere of the predictor has no floor to draw
@@ -59,17 +52,6 @@ def test_a_file_of_the_user_needs_overwrite_and_our_own_does_not(
     assert run([*command, "-o", str(file)]) == 0, "pansplat wrote it"
 
 
-def test_the_folder_of_a_page_keeps_files_of_the_user(scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "page"
-    own = write_own(out / "index_files" / "0123456789abcdef.bin")
-    for count in ("100", "50"):
-        assert run(["export", str(scene), "-o", str(out), "--gaussians", count]) == 0
-    others = [file for file in own.parent.iterdir() if file != own]
-    assert own.read_bytes() == OWN and len(others) == 3 and all(map(is_written, others)), (
-        "parts of the first page are removed"
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "command"),
     [
@@ -77,13 +59,9 @@ def test_the_folder_of_a_page_keeps_files_of_the_user(scene: Path, tmp_path: Pat
         ("results.json", ["evaluate", "{room}", "--model", "sphere"]),
         ("room/target.png", ["evaluate", "{room}", "--model", "sphere"]),
         ("raster.json", ["bench", "raster", "--quick"]),
-        ("raster.md", ["bench", "raster", "--quick"]),
-        ("raster.png", ["bench", "raster", "--quick"]),
     ],
 )
-def test_files_of_the_user_in_a_folder_need_overwrite(
-    room: Path, tmp_path: Path, name: str, command: list[str], refusal: Callable[..., str]
-) -> None:
+def test_files_of_the_user_in_a_folder_need_overwrite(room, tmp_path, name: str, command: list[str], refusal) -> None:
     own = write_own(tmp_path / "out" / name)
     message = refusal(*(part.format(room=room) for part in command), "-o", tmp_path / "out")
     assert f"got {own}, which pansplat did not write; choose another name, or replace them with --overwrite" in message

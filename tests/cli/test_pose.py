@@ -17,7 +17,6 @@ from pansplat.images.image_files import write_image
 from pansplat.poses.estimate import NoPosesError, PoseEstimate, PoseGroup
 from pansplat.poses.two_view import RelativePose
 from pansplat.prediction_options import PredictOptions, ReadOptions
-from pansplat.system.progress import is_progress_shown
 from pansplat.system.store import Store
 from pansplat_viewer import run as run_viewer
 from pansplat_viewer.core.loader import find_entries
@@ -55,9 +54,7 @@ def estimator(monkeypatch):
     return lambda function: monkeypatch.setattr("pansplat.poses.files.estimate_poses", function)
 
 
-def test_measured_poses_are_an_error_before_the_estimate_and_replaced_with_overwrite(
-    folder: Path, estimator, capsys
-) -> None:
+def test_measured_poses_are_an_error_before_the_estimate_and_replaced_with_overwrite(folder, estimator, capsys) -> None:
     file = folder / "poses.json"
     poses = {f"{each}.png": np.eye(4).tolist() for each in "ab"}
     file.write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
@@ -165,9 +162,7 @@ WITHOUT_CACHES = {
 
 
 @pytest.mark.parametrize("linked", ["a web tour of cube faces"], indirect=True)
-def test_without_caches_no_file_is_written_to_them_or_read(
-    linked: Path, tmp_path: Path, estimator, monkeypatch
-) -> None:
+def test_without_caches_no_file_is_written_to_them_or_read(linked: Path, tmp_path, estimator, monkeypatch) -> None:
     """Poses, overlaps, the floor plan, and the descriptions of cube faces, of a folder without poses."""
     calls, cache, out = [], tmp_path / "cache", linked.parent / "out"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
@@ -195,20 +190,6 @@ def test_without_caches_no_file_is_written_to_them_or_read(
     pansplat.predict(linked, "sphere", cache=False)
     assert list_files() == kept and calls == [0], "nothing is read"
     fingerprint_work.cache_clear()
-
-
-@pytest.mark.parametrize("command", ["predict", "render", "export", "refine"])
-def test_commands_show_the_estimate_of_poses(command: str, folder: Path, tmp_path: Path, estimator) -> None:
-    shown = []
-
-    def record(images, **options) -> PoseEstimate:
-        shown.append(is_progress_shown())
-        raise NoPosesError(dict.fromkeys(images, "no door"))
-
-    estimator(record)
-    out = tmp_path / {"render": "view.png", "export": "view.html"}.get(command, "view.ply")
-    run([command, str(folder), "--model", "sphere", "-o", str(out)])
-    assert shown == [True]
 
 
 def test_the_written_poses_are_those_that_other_commands_use(linked: Path, estimator) -> None:
@@ -245,9 +226,7 @@ def test_figures_of_reasons_are_for_verbose(folder: Path, estimator, monkeypatch
         assert "too little in common" in printed and ("20 places" in printed) == bool(options)
 
 
-def test_poses_of_cube_faces_beside_each_other_are_refused_before_the_estimate(
-    tmp_path: Path, write_tiles, estimator, capsys
-) -> None:
+def test_poses_of_cube_faces_beside_each_other_are_refused_before_an_estimate(tmp_path, write_tiles, estimator, capsys):
     for name in "ab":
         write_tiles(32, 32, lambda face, row, column, name=name: tmp_path / f"{name}_{face}.png")
     estimator(_refuse)

@@ -32,9 +32,7 @@ def test_a_pair_is_predicted_and_refined(room: Path, scene: Path, tmp_path: Path
     assert refined.names == predicted.names and refined.cam2world.equal(predicted.cam2world)
 
 
-def test_a_command_says_what_runs_where_and_refuses_a_card_that_is_not_there(
-    room: Path, scene: Path, tmp_path: Path, refusal, capsys, monkeypatch
-) -> None:
+def test_a_command_says_what_runs_where_and_refuses_a_missing_card(room, scene, tmp_path, refusal, capsys, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert refine(scene, tmp_path / "scene.ply", "--photographs", room, "--verbose") == 0
     assert "note: refinement: on the processor\n" in capsys.readouterr().err

@@ -47,14 +47,8 @@ def _render_room(cam2world: torch.Tensor) -> torch.Tensor:
 
 
 def _views(*poses: torch.Tensor, near: float = 0.45, far: float = 10.0) -> Views:
-    return Views(
-        torch.stack([_render_room(pose) for pose in poses]),
-        torch.stack(poses),
-        torch.ones(len(poses), _HEIGHT, 2 * _HEIGHT, dtype=torch.bool),
-        near,
-        far,
-        tuple("abc"[: len(poses)]),
-    )
+    images, masks = torch.stack([_render_room(pose) for pose in poses]), torch.ones(len(poses), _HEIGHT, 2 * _HEIGHT)
+    return Views(images, torch.stack(poses), masks.bool(), near, far, tuple("abc"[: len(poses)]))
 
 
 _TILTED = (_pose((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)), _pose((0.6, -0.15, -0.6, 0.1), (-0.5, -0.2, 0.5)))
@@ -108,11 +102,6 @@ def test_a_nearly_perfect_fit_or_an_interpretation_that_stands_out_little_is_no_
     assert _describe_mistake(errors | {"opengl axes": 0.490, "swapped views": 0.499}) is not None
 
 
-def test_right_poses_far_apart_are_judged_by_how_much_better_they_fit() -> None:
-    assert _can_judge({AS_GIVEN: 0.508, "inverse": 0.596, "opengl axes": 0.668})
-    assert not _can_judge({AS_GIVEN: 0.574, "inverse": 0.588, "opengl axes": 0.600})
-
-
 _SIDE_BY_SIDE = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
 
 
@@ -129,11 +118,6 @@ def test_interpretations_that_fit_about_as_well_are_named() -> None:
     errors = {"inverse": 0.443, AS_GIVEN: 0.445, "mirrored up-down": 0.450, "swapped views": 0.470}
     check = PoseCheck("pair", 1.0, 0.445, errors, (), None, True, ())
     assert check.similar == ("inverse", "mirrored up-down")
-
-
-def test_three_views_are_checked_together() -> None:
-    third = _pose((0.95, 0.0, 0.2, 0.1), (0.2, 0.1, 0.6))
-    assert _best(check_views(_views(*_TILTED, third))) == AS_GIVEN
 
 
 def test_implausible_poses_and_unrelated_images_give_a_warning() -> None:

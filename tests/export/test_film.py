@@ -63,9 +63,8 @@ def test_the_photograph_is_shown_at_its_panorama_and_fades_as_the_camera_leaves(
         assert index == 0 and weight == pytest.approx(expected)
         image = stops.cover(index, weight, pose, PLANE, lambda: drawn.append(1) or GAUSSIANS)
         assert (len(drawn) > 0) == (weight < 1), "a whole photograph needs no Gaussians"
-        mixed = ((image - GAUSSIANS) * (directions(pose) - GAUSSIANS)).sum() / (
-            (directions(pose) - GAUSSIANS) ** 2
-        ).sum()
+        along = directions(pose) - GAUSSIANS
+        mixed = ((image - GAUSSIANS) * along).sum() / (along**2).sum()
         assert mixed == pytest.approx(weight, abs=0.02)
     assert FilmPhotographs((), POSES).find_stop(pose) == (None, 0.0)
 

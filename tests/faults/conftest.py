@@ -60,9 +60,8 @@ def originals(tmp_path_factory: pytest.TempPathFactory, small_config: Any, write
     pipeline.save(make_scene(), folder / "scene.ply")
     torch.manual_seed(0)
     network = PanSplat(small_config)
-    save_weights(
-        folder / "weights.safetensors", pack_weights("pansplat", small_config, network.state_dict(), compat="fixed")
-    )
+    packed = pack_weights("pansplat", small_config, network.state_dict(), compat="fixed")
+    save_weights(folder / "weights.safetensors", packed)
     return folder
 
 

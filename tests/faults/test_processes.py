@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +16,10 @@ PREDICT = "predict pair -o out.ply --model sphere --height 64 --refine 0"
 EVALUATE = "evaluate pair --out report --model sphere --height 64"
 
 
-# Signals, in this process
-
-
 @pytest.mark.parametrize(
     ("command", "number"), [(PREDICT, signal.SIGINT), (PREDICT, signal.SIGTERM), (EVALUATE, signal.SIGINT)]
 )
-def test_a_signal_ends_a_command_quietly(
-    command: str,
-    number: signal.Signals,
-    attack: Callable[..., Any],
-    sphere_predictor: type,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_signal_ends_a_command_quietly(command, number, attack, sphere_predictor, monkeypatch) -> None:
     monkeypatch.setattr(sphere_predictor, "__call__", lambda *_, **__: signal.raise_signal(number))
     handlers = [signal.getsignal(kind) for kind in (signal.SIGINT, signal.SIGTERM)]
     outcome = attack(command.split())
@@ -105,9 +95,8 @@ class Cases:
 
     def run(self) -> list[str]:
         """Run all cases; returns what is wrong."""
-        done = subprocess.run(
-            [sys.executable, "-c", _FORK_SERVER], input=json.dumps(self.cases), capture_output=True, text=True
-        )
+        command = [sys.executable, "-c", _FORK_SERVER]
+        done = subprocess.run(command, input=json.dumps(self.cases), capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         wrong = []
         for case, status in zip(self.cases, map(int, done.stdout.split()), strict=True):

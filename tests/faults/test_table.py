@@ -46,9 +46,6 @@ PREDICT = "predict pair -o out.ply --model sphere --height 64 --refine 0"
 WEIGHTS = "predict pair -o out.ply --model weights.safetensors --height 64"
 
 
-# Scene files
-
-
 def content(data: bytes | Callable[[bytes], bytes], name: str = "scene.ply") -> Damage:
     def write(folder: Path) -> None:
         path = folder / name
@@ -70,9 +67,6 @@ SCENES = [
     Fault("vertices: -3e38, drawn", DRAW, content(far_away), "", 0),
     Fault("a page over a file named like its folder", "export scene.ply -o tour", lambda folder: ((folder / "tour").mkdir(), (folder / "tour/index_files").write_text("")), "index_files"),
 ]  # fmt: skip
-
-
-# Command lines
 
 
 TRAIN = "pansplat-train tiny --out run --device cpu"
@@ -103,9 +97,6 @@ OPTIONS = [
 ]  # fmt: skip
 
 
-# Folders and files of weights
-
-
 def text(value: str, name: str) -> Damage:
     return lambda folder: (folder / name).write_text(value)
 
@@ -129,9 +120,6 @@ WEIGHTS_FILES = [
     Fault("convert: a scene", "convert scene.ply -o m.safetensors", says="scene.ply"),
     Fault("train: initial weights of another network", TRAIN + " --network.init weights.safetensors --data.workers 0 --perceptual structure", says="weights.safetensors"),
 ]  # fmt: skip
-
-
-# What stands where a file is needed, or where one is written
 
 
 def fifo(name: str) -> Damage:
@@ -251,9 +239,7 @@ WRITTEN = {
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_file_on_a_full_disk_is_one_line_and_the_old_file_stays(
-    name: str, folder: Path, attack: Callable[..., Any], full_disk: Callable
-) -> None:
+def test_a_file_on_a_full_disk_is_one_line_and_the_old_file_stays(name: str, folder, attack, full_disk) -> None:
     assert attack([*WRITTEN[name].split(), name]).status == 0
     before = (folder / name).read_bytes()
     with full_disk(300):

@@ -62,9 +62,7 @@ def test_work_that_has_not_begun_has_no_time_left(clock, capsys) -> None:
 
 
 @pytest.mark.parametrize("is_file", [True, False])
-def test_a_terminal_shows_a_bar_and_standard_output_stays_complete(
-    monkeypatch: pytest.MonkeyPatch, is_file: bool
-) -> None:
+def test_a_terminal_shows_a_bar_and_standard_output_stays_complete(monkeypatch, is_file: bool) -> None:
     out, err = io.StringIO() if is_file else Terminal(), Terminal()
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", err)

@@ -120,14 +120,6 @@ def _used_address(shape, dtype):
     return Workspace().array(shape, dtype).ctypes.data
 
 
-@pytest.mark.usefixtures("no_idle_memory")
-def test_memory_of_a_workspace_is_reused_after_its_end():
-    address = _used_address((100, 16), np.float32)
-    first, second = Workspace(), Workspace()
-    assert first.array((50, 32), np.float32).ctypes.data == address
-    assert second.array((50, 32), np.float32).ctypes.data != address
-
-
 @pytest.mark.parametrize("shape", [(3, 16), (7,), 5, (0, 4), ()])
 def test_arrays_are_contiguous_and_aligned_to_a_cache_line(shape):
     workspace = Workspace()

@@ -96,9 +96,7 @@ def test_another_key_or_kind_has_another_entry(folder: Path) -> None:
     assert sorted(entries.list_values("pair")) == [["pair", "1"], ["pair", "2"]]
 
 
-def test_what_cannot_be_written_to_the_folder_is_in_the_users_cache_or_kept_until_the_end(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_what_cannot_be_written_to_the_folder_is_in_the_users_cache_or_kept_until_the_end(folder, tmp_path) -> None:
     (folder / ".pansplat").write_text("")  # unwritable, for root too
     Store(folder).get("view", "key", lambda: 1)
     assert Store(folder).get("view", "key", fail) == 1 and len(list((tmp_path / "home").rglob("*.entry"))) == 1
@@ -124,9 +122,7 @@ def test_what_cannot_be_restored_is_not_written(folder: Path) -> None:
     assert not (folder / ".pansplat").exists()
 
 
-def test_the_entries_that_were_used_least_recently_are_removed_above_the_limit_and_none_in_use(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_entries_that_were_used_least_recently_are_removed_above_the_limit_and_none_in_use(folder, monkeypatch):
     entries = Store(folder)
 
     def add(key: str) -> Path:

@@ -16,9 +16,8 @@ def test_a_section_on_one_thread_restores_the_number_of_threads() -> None:
     np.ones((8, 8)) @ np.ones((8, 8))  # loads the library
 
     def count() -> tuple[int, set[int]]:
-        return torch.get_num_threads(), {
-            each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"
-        }
+        pools = [each for each in threadpool_info() if each["user_api"] == "blas"]
+        return torch.get_num_threads(), {each["num_threads"] for each in pools}
 
     before = count()
     with one_thread():

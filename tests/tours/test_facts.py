@@ -29,9 +29,7 @@ def forbid(*_: object) -> None:
     pytest.fail("computed again")
 
 
-def test_what_is_read_from_the_store_equals_what_was_computed(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_read_from_the_store_equals_what_was_computed(scene, tmp_path, monkeypatch) -> None:
     computed = TourFacts(scene, folder=tmp_path)
     expected = [getattr(computed, part) for part in PARTS]
     assert len(computed.plan.rooms) == 1 and set(computed.outlines) == {0, 1}
@@ -77,9 +75,7 @@ def test_nothing_is_written_without_a_folder(scene: Scene, tmp_path: Path, monke
     assert TourFacts(scene).plan.rooms and list(tmp_path.iterdir()) == []
 
 
-def test_the_plan_of_a_file_is_stored_beside_the_panoramas(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_plan_of_a_file_is_stored_beside_the_panoramas(scene, tmp_path, monkeypatch) -> None:
     first = write_plan(scene, tmp_path / "first.svg", tmp_path)
     for name in ("find_surfaces", "make_plan"):
         monkeypatch.setattr(facts, name, forbid)

@@ -51,9 +51,8 @@ def test_all_panoramas_of_a_folder_of_parts_are_one_tour(home):
 def test_single_views_are_between_the_other_panoramas_of_a_tour_in_file_order(make_tour):
     a, b, c = make_tour([(0, 0), (0, 1), (0, 2)], ()).panoramas
     together = PanoramaSet("", Path("house"), (a, c), (), 0.45, 10.0, (a.image, c.image))
-    alone = PanoramaSet(
-        "", Path("house"), (dataclasses.replace(b, world=1),), (), 0.45, 10.0, (a.image, b.image, c.image)
-    )
+    alone = (dataclasses.replace(b, world=1),)
+    alone = PanoramaSet("", Path("house"), alone, (), 0.45, 10.0, (a.image, b.image, c.image))
     (tour,) = find_tours([together, alone])
     assert [panorama.name for panorama in tour.panoramas] == ["p0", "p1", "p2"] and tour.parts == (0, 1, 0)
     pair = tour.make_set((0, 2))

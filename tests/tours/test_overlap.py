@@ -62,7 +62,6 @@ def test_overlaps_are_measured_again_only_if_an_image_or_a_pose_has_changed(tmp_
     assert connect(tour).overlaps != first.overlaps and len(measured) == 2, "the image has changed"
     pose = tour.cam2world[1].clone()
     pose[0, 3] += 0.2
-    connect(
-        dataclasses.replace(tour, panoramas=(tour.panoramas[0], dataclasses.replace(tour.panoramas[1], cam2world=pose)))
-    )
+    moved = dataclasses.replace(tour.panoramas[1], cam2world=pose)
+    connect(dataclasses.replace(tour, panoramas=(tour.panoramas[0], moved)))
     assert len(measured) == 3, "a pose has changed"

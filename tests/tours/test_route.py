@@ -192,11 +192,8 @@ def test_beside_its_panorama_a_photograph_is_seen_as_if_surfaces_were_2_5_metres
     assert not find_offset(pose, pose[:3, 3]).any()
 
 
-@pytest.mark.parametrize(("unit", "origin"), [(1e3, (0, 0, 0)), (1.0, (5e6, 4e5, 120)), (1e3, (5e9, 4e8, 1e5))])
-def test_a_home_in_another_unit_or_far_from_the_origin_has_the_same_flight_and_graph(
-    tmp_path: Path, unit: float, origin: tuple[float, float, float]
-) -> None:
-    metres, other = _load_home(tmp_path / "metres"), _load_home(tmp_path / "other", unit, origin)
+def test_a_home_in_another_unit_far_from_the_origin_has_the_same_flight_and_graph(tmp_path: Path) -> None:
+    metres, other = _load_home(tmp_path / "metres"), _load_home(tmp_path / "other", 1e3, (5e9, 4e8, 1e5))
     assert np.ptp(other.positions, axis=0).max() == pytest.approx(9.0), "metres again"
     assert plan_walk(metres) == plan_walk(other) and list(metres.overlaps) == list(other.overlaps)
     assert assign_storeys(metres) == assign_storeys(other) == [0, 0, 0, 1, 1]

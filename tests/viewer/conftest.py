@@ -152,15 +152,9 @@ def turn() -> Callable[[np.ndarray, float], np.ndarray]:
 def _rasterize_reference(
     scene: Scene, cam2world: np.ndarray, size: tuple[int, int], settings: DrawSettings
 ) -> Rendering:
-    return rasterize(
-        scene.gaussians.to(dtype=torch.float64),
-        torch.from_numpy(cam2world),
-        size=size[::-1],
-        layout="pinhole",
-        vertical_fov_degrees=settings.vertical_fov_degrees,
-        background=settings.background,
-        near=settings.near,
-    )
+    options = {"vertical_fov_degrees": settings.vertical_fov_degrees, "near": settings.near}
+    options |= {"size": size[::-1], "layout": "pinhole", "background": settings.background}
+    return rasterize(scene.gaussians.to(dtype=torch.float64), torch.from_numpy(cam2world), **options)
 
 
 @pytest.fixture
@@ -303,25 +297,17 @@ def _load_house(entry: SceneEntry) -> LoadedScene:
         entry = SceneEntry(entry.name, pair=tour.make_set(views), tour=tour, views=views)
     directions, cam2world = fibonacci_directions(500), tour.cam2world[list(entry.views)]
     color = torch.tensor((0.3, 0.5, 0.7)).roll(sum(entry.views)) + 0.2 * directions
-    parts = [
-        make_balls(pose[:3, 3] + 4 * directions, 0.5, 0.95, color=color, views=view)
-        for view, pose in enumerate(cam2world)
-    ]
+    places = [pose[:3, 3] + 4 * directions for pose in cam2world]
+    parts = [make_balls(means, 0.5, 0.95, color=color, views=view) for view, means in enumerate(places)]
     scene = Scene(Gaussians.cat(parts), cam2world, 0.45, 10.0, (), "synthetic", 64)
     angles = torch.linspace(0, 2 * torch.pi, 13)[:-1]
     corners = torch.stack((angles.sin(), angles.cos()), dim=1).double().numpy()
     centers = {view: tour.positions[view][[0, 2]] for view in entry.views}
     outlines = {view: FloorOutline(center + corners, 1.0) for view, center in centers.items()}
     facts = TourFacts(scene, tour, entry.views)
-    outlooks = np.zeros((len(entry.views), BINS))
-    vars(facts).update(
-        outlines=outlines,
-        outlooks=outlooks,
-        clearances=outlooks[:, None].repeat(12, 1),
-        hidden=[[] for _ in entry.views],
-        walls=[],
-        poor=(),
-    )
+    outlooks, hidden = np.zeros((len(entry.views), BINS)), [[] for _ in entry.views]
+    vars(facts).update(outlines=outlines, outlooks=outlooks, hidden=hidden, walls=[], poor=())
+    vars(facts).update(clearances=outlooks[:, None].repeat(12, 1))
     return LoadedScene(entry, scene, facts=facts)
 
 

@@ -134,9 +134,7 @@ class App:
     @property
     def node(self) -> int:
         """The panorama of the tour that is nearest to the camera."""
-        return int(
-            np.linalg.norm(self.viewer.session.tour.tour.positions - self.state.camera.position, axis=1).argmin()
-        )
+        return int(np.linalg.norm(self.session.tour.tour.positions - self.state.camera.position, axis=1).argmin())
 
     @property
     def content(self) -> object:
@@ -274,7 +272,7 @@ def act(app: App, text: str) -> None:
             app.frame(**{kind: numbers[0] if kind == "scroll" else numbers})
 
 
-RESET = ("orbiting", "playing", "flight", "overlay", "help", "quit", "path", "points")
+RESET = ("orbiting", "playing", "route_fraction", "overlay", "help", "quit", "path", "points")
 
 
 def test_the_state_of_the_window_after_what_a_user_does(app):
@@ -294,9 +292,6 @@ def test_the_state_of_the_window_after_what_a_user_does(app):
 def test_each_key_has_one_action():
     keys = [key for row in KEYS for key in row.actions]
     assert len(set(keys)) == len(keys)
-
-
-# --- scenes ---
 
 
 def test_errors_of_paths_and_scenes_keep_what_is_shown(app, small_scene):
@@ -418,9 +413,7 @@ def test_a_refined_scene_that_cannot_be_drawn_is_one_error_and_the_prediction_st
         (moderngl.Error("GLSL Compiler failed"), "large: OpenGL failed: GLSL Compiler failed"),
     ],
 )
-def test_a_scene_that_cannot_be_drawn_is_an_error_and_the_scene_before_stays(
-    app, small_scene, monkeypatch, error, message
-):
+def test_a_scene_that_cannot_be_drawn_is_an_error_and_the_old_one_stays(app, small_scene, monkeypatch, error, message):
     twice = replace(small_scene, gaussians=Gaussians.cat([small_scene.gaussians] * 2))
     monkeypatch.setattr(NoRenderer, "refuse", staticmethod(lambda scene: error if scene is twice else None))
     app.load = lambda entry, *_: LoadedScene(entry, twice)
@@ -493,9 +486,6 @@ def test_a_reload_searches_the_folder_again(app, pair, tmp_path):
     assert app.session.names[app.session.current] == "pair 1" and app.session.current == 1
 
 
-# --- photographs and comparison ---
-
-
 def test_a_panorama_alone_is_entered_in_a_wide_view(make_app, tmp_path):
     image = np.full((64, 128, 3), 0.6, np.float32)
     image[20:44, 90:106:2] = 0.1  # 0.37 to 0.41 of a turn right of the left border, at 1.67 radians
@@ -527,9 +517,6 @@ def test_a_photograph_that_cannot_be_read_is_an_error(app, pair, tmp_path):
     app.show(SceneEntry("broken", pair=replace(pair, context=(broken, pair.context[1]))))
     app.settle()
     assert "gone.png" in app.viewer.error
-
-
-# --- screenshots, paths and films ---
 
 
 def test_a_screenshot_without_memory_is_reported(app, monkeypatch):
@@ -573,9 +560,8 @@ def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(mak
 
     app.load = load
     app.session.show([SceneEntry(house.name, tour=house)], 0)
-    app.until(
-        lambda: app.session.tour is not None and (app.session.tour.tour.poor or app.session.tour.tour.walls), "edges"
-    )
+    session = app.session
+    app.until(lambda: session.tour is not None and (session.tour.tour.poor or session.tour.tour.walls), "edges")
     tour, edges = app.session.tour, app.session.tour.tour
     go.set()
     app.settle()
@@ -599,9 +585,8 @@ def test_a_note_is_put_at_the_middle_and_removed(make_app, house):
     (note,) = load_panoramas(house.folder)[index].notes
     expected = replace(app.state.camera, yaw_radians=-1.0).rotation[:, 2]
     assert note.text == "door" and photographs.list_notes(index)[0].text == "door"
-    assert find_direction(house.panoramas[index].cam2world, note.yaw, note.pitch).numpy() == pytest.approx(
-        expected, abs=1e-4
-    )
+    seen = find_direction(house.panoramas[index].cam2world, note.yaw, note.pitch).numpy()
+    assert seen == pytest.approx(expected, abs=1e-4)
     written = file.read_bytes()
     app.state.camera = replace(app.state.camera, position=(0.0, 0.0, 0.4))
     app.viewer.put_note("between")
@@ -631,9 +616,6 @@ def test_before_surfaces_the_camera_stops_and_says_why_once(make_app, sphere_pre
         for _ in range(10):
             app.frame(0.2, held=frozenset("s"))
         assert np.linalg.norm(app.state.camera.position) < 0.6
-
-
-# --- tours ---
 
 
 @pytest.fixture

@@ -1,18 +1,36 @@
-"""A scene of coloured Gaussians around three cameras."""
+"""Scenes of coloured Gaussians around three cameras, their pages, and the browser that shows them."""
 
 import dataclasses
 import math
-from collections.abc import Callable
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from browser_pages import HOST, LIMIT, OPTIONS, ORIGINS, QuietHandler, Sites
 from PIL import Image
 
+from pansplat.export import page as page_module
+from pansplat.export import page_files
+from pansplat.export.page import write_page
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.fibonacci import fibonacci_directions
-from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
+from pansplat.inputs.panorama_sets import Note, Panorama, PanoramaSet
+from pansplat.tours.facts import TourFacts
+
+
+@pytest.fixture(autouse=True)
+def small_poster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pansplat.export.page._POSTER_SIZE", (27, 32))
 
 
 def make_scene(num_views: int = 3, per_view: int = 700, degree: int = 1, seed: int = 0) -> Scene:
@@ -112,3 +130,77 @@ def take_photographs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scen
         return pairs
 
     return take
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A browser; without one the tests fail in CI and are skipped elsewhere."""
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        program = None
+    if program is None:
+        missing = "Chromium (Debian package chromium) and playwright (pip install -e '.[dev]')"
+        if os.environ.get("CI"):
+            pytest.fail(f"CI needs {missing}")
+        pytest.skip(f"needs {missing}")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=list(OPTIONS), timeout=1000 * LIMIT)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sites]:
+    folder = tmp_path_factory.mktemp("pages")
+    (folder / "host.html").write_text(HOST)
+    with ExitStack() as stack:
+        origins = []
+        for _ in range(2):
+            handler = partial(QuietHandler, directory=str(folder))
+            server = stack.enter_context(ThreadingHTTPServer(("127.0.0.1", 0), handler))
+            Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+            stack.callback(server.shutdown)
+            origins.append(f"http://127.0.0.1:{server.server_port}")
+        ORIGINS[folder] = origins[0]
+        yield Sites(folder, *origins)
+
+
+@pytest.fixture(scope="session")
+def photographs(scene: Scene, take_photographs: Callable[..., list[PanoramaSet]]) -> list[PanoramaSet]:
+    """Of the scene, 1024 rows; the second one has a note ahead on the right, the third one another."""
+    taken = take_photographs(scene, 1024)
+    links = ("https://example.org/a?b=<c>&d", "http://example.org")
+    notes = Note(0.3, 0.1, "<b>Oak</b>\nfloor", links), Note(1.0, 0.0, "x")
+    for number, note in enumerate(notes, start=1):
+        (panorama,) = taken[number].context
+        taken[number] = dataclasses.replace(taken[number], context=(dataclasses.replace(panorama, notes=(note,)),))
+    return taken
+
+
+@pytest.fixture(scope="session")
+def folder(scene, house, flat, sites, photographs, take_photographs) -> Path:
+    """tour.html, split.html with files, house.html with a graph, flat.html with parts.
+
+    photos.html, photos/index.html and rooms.html (as flat.html) have photographs; poor/index.html has a poor edge.
+    """
+    folder = sites.folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page_module, "_POSTER_SIZE", (27, 32))
+        patch.setattr(page_files, "_PART_BYTES", 30_000)
+        patch.setattr(TourFacts, "poor", ())  # surfaces of the scenes do not agree
+        write_page(scene, folder / "tour.html", title="Three rooms")
+        write_page(scene, folder / "split.html", split=True)
+        write_page(house, folder / "house.html")
+        write_page(flat, folder / "flat.html")
+        write_page(flat, folder / "rooms.html", photographs=take_photographs(flat, 256))
+        write_page(scene, folder / "photos.html", photographs=photographs)
+        (folder / "photos").mkdir()
+        write_page(scene, folder / "photos" / "index.html", photographs=photographs, split=True)
+        write_page(house, folder / "hosted.html", split=True)
+        (folder / "poor").mkdir()
+        poor = {"photographs": photographs, "photo_height": 512, "split": True}
+        patch.setattr(TourFacts, "poor", ((0, 1),))
+        write_page(house, folder / "poor" / "index.html", **poor)
+    return folder

@@ -53,9 +53,7 @@ def order(scene: Scene, packed: PackedGaussians) -> np.ndarray:
     return found.numpy()
 
 
-def test_means_and_scales_are_rounded_to_the_stated_digits(
-    scene: Scene, packed: PackedGaussians, order: np.ndarray
-) -> None:
+def test_means_and_scales_are_rounded_to_the_stated_digits(scene, packed, order) -> None:
     planes = read_planes(packed)
     means = scene.gaussians.means.double().numpy()[order] - ORIGIN
     scales = scene.gaussians.scales.double().numpy()[order]
@@ -66,18 +64,14 @@ def test_means_and_scales_are_rounded_to_the_stated_digits(
         assert (error <= 2.0**-8 * scales[:, axis]).all()
 
 
-def test_rotations_are_rounded_by_less_than_a_fifth_of_a_degree(
-    scene: Scene, packed: PackedGaussians, order: np.ndarray
-) -> None:
+def test_rotations_are_rounded_by_less_than_a_fifth_of_a_degree(scene, packed, order) -> None:
     read = rotations_from_quats(torch.from_numpy(read_quats(read_planes(packed)[15:19])))
     needed = rotations_from_quats(scene.gaussians.quats.double()[order])
     cosines = ((read * needed).sum((1, 2)) - 1) / 2
     assert float(cosines.clamp(-1, 1).acos().rad2deg().max()) < 0.2
 
 
-def test_colours_opacities_and_harmonics_are_within_half_a_step(
-    scene: Scene, packed: PackedGaussians, order: np.ndarray
-) -> None:
+def test_colours_opacities_and_harmonics_are_within_half_a_step(scene, packed, order) -> None:
     planes = read_planes(packed).astype(np.float64)
     harmonics = scene.gaussians.harmonics.double().numpy()[order]
     low, high = packed.color_range
@@ -110,8 +104,6 @@ def test_extreme_numbers_are_packed(scene: Scene) -> None:
     planes = read_planes(pack_gaussians(extreme, np.zeros(3), (0,), 1))
     quats = read_quats(planes[15:19])
     for k in range(3):
-        assert (
-            np.isfinite(join(planes[3 * k : 3 * k + 3])).all()
-            and np.isfinite(join(planes[9 + 2 * k : 11 + 2 * k])).all()
-        )
+        assert np.isfinite(join(planes[3 * k : 3 * k + 3])).all()
+        assert np.isfinite(join(planes[9 + 2 * k : 11 + 2 * k])).all()
     assert np.isfinite(quats).all() and np.allclose(np.linalg.norm(quats, axis=1), 1)

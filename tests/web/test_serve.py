@@ -1,12 +1,9 @@
 """Pages on the local network: real requests by https, the QR code, the end by Ctrl+C."""
 
 import http.client
-import os
 import signal
 import socket
 import ssl
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +11,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from pansplat.export import page as page_module
+from pansplat.cli import run
 from pansplat.export import page_server as serve_module
 from pansplat.export.page import write_page
 from pansplat.export.page_server import PageServer, make_certificate
@@ -23,9 +20,8 @@ from pansplat.pipeline import save
 
 
 @pytest.fixture
-def server(plain_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PageServer]:
+def server(plain_scene: Scene, tmp_path: Path) -> Iterator[PageServer]:
     """A page in two files beside another file."""
-    monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
     (tmp_path / "secret.html").write_text("not for others")
     with PageServer(write_page(plain_scene, tmp_path / "our home.html", split=True)) as server:
         threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
@@ -83,9 +79,7 @@ def test_every_answer_forbids_frames_and_guesses_of_types(server: PageServer) ->
         assert answer.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
 
 
-def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(
-    server: PageServer, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(server, capfd) -> None:
     port = server.server_address[1]
     with socket.create_connection(("127.0.0.1", port)), socket.create_connection(("127.0.0.1", port)) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\n\r\n")
@@ -104,28 +98,12 @@ def test_the_certificate_names_the_address_and_is_not_an_authority(monkeypatch: 
     assert serve_module.find_address() == "127.0.0.1", "that of the machine, without a network"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_export_serves_until_a_signal(plain_scene: Scene, tmp_path: Path, number: int) -> None:
+def test_export_serves_until_a_signal(plain_scene, tmp_path, monkeypatch, capsys, number: int) -> None:
     save(plain_scene, tmp_path / "scene.ply")
-    program = "from pansplat.cli import main; main()"
-    arguments = ["export", tmp_path / "scene.ply", "--gaussians", "100", "--serve", "-o", tmp_path / "page.html"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONIOENCODING": "utf-8"},
-    )
-    assert process.stdout is not None
-    lines: list[str] = []
-    killer = threading.Timer(600, process.kill)
-    killer.start()
-    while not lines or "https://" not in lines[-1]:
-        lines.append(process.stdout.readline().decode())
-        assert lines[-1], lines
-    process.send_signal(number)
-    out, errors = process.communicate()
-    killer.cancel()
-    assert process.returncode == 0
-    assert out.decode() == "stopped\n" and "Traceback" not in errors.decode()
-    assert sum("█" in line for line in lines) > 10
+    monkeypatch.setattr(PageServer, "serve_forever", lambda server: signal.raise_signal(number))
+    arguments = ["export", tmp_path / "scene.ply", "--serve", "-o", tmp_path / "page.html"]
+    assert run(list(map(str, arguments))) == 0
+    out, errors = capsys.readouterr()
+    assert "https://" in out and out.endswith("stopped\n") and "Traceback" not in errors
+    assert sum("█" in line for line in out.splitlines()) > 10

@@ -30,17 +30,13 @@ def test_the_hotspot_of_a_link_is_where_it_meets_the_floor_or_a_wall(parted_hous
     focal = 100 / np.tan(np.radians(60))
     assert hotspot.center == pytest.approx((100 + focal * np.tan(0.1), 100 + focal * np.tan(0.6) / np.cos(0.1)))
     scenes.move(parted_house.positions[3])
-    for pitch, slope in ((1.4, 1.0), (0.05, np.tan(0.05)), (-0.2, np.tan(-0.2))):  # on the floor, on a wall 3 m away
-        panoramas = list(parted_house.panoramas)
-        panoramas[3] = replace(panoramas[3], links=(Link("room2", 0.0, pitch),))
-        scenes.tour = replace(parted_house, panoramas=tuple(panoramas))
-        (hotspot,) = find_rings(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
-        assert hotspot.center == pytest.approx((100, 100 + focal * slope)) and hotspot.label == "room2"
-        width, height = np.ptp(hotspot.ring, axis=0)
-        assert (height == pytest.approx(width, rel=0.01)) == (pitch < 1), "a ring on a wall is upright"
-    scenes.outlooks[3] = np.full(BINS, 2.0)
+    panoramas = list(parted_house.panoramas)
+    panoramas[3] = replace(panoramas[3], links=(Link("room2", 0.0, -0.2),))  # on a wall
+    scenes.tour = replace(parted_house, panoramas=tuple(panoramas))
     (hotspot,) = find_rings(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (200, 200))
-    assert np.ptp(hotspot.ring, axis=0)[0] == pytest.approx(1.5 * width, rel=0.05), "a nearer wall"
+    assert hotspot.center == pytest.approx((100, 100 + focal * np.tan(-0.2))) and hotspot.label == "room2"
+    width, height = np.ptp(hotspot.ring, axis=0)
+    assert height == pytest.approx(width, rel=0.01), "it is upright"
     scenes.outlooks[3] = np.full(BINS, 0.6)
     (hotspot,) = find_rings(scenes, replace(camera, position=(20.0, 0.0, 1.6)), (1280, 720))
     assert np.ptp(hotspot.ring, axis=0)[0] == pytest.approx(128, abs=1) and hotspot.radius == 64, "no ring is larger"

@@ -14,10 +14,8 @@ from pansplat.errors import InputWarning
 from pansplat.gaussians.ply import save_ply
 from pansplat.gaussians.scene import SceneTour
 from pansplat.geometry.world import WorldFrame
-from pansplat.pipeline import models
 from pansplat.prediction_options import PredictOptions, ReadOptions
 from pansplat.system.progress import report_progress
-from pansplat.tours.merge import select_views
 from pansplat_viewer.core.loader import SceneEntry, find_entries, list_panoramas_of_folder, load_entry
 from pansplat_viewer.core.settings import DrawSettings
 from pansplat_viewer.core.state import fit_settings
@@ -119,33 +117,6 @@ def test_the_first_scene_is_where_the_photographs_are_and_the_rest_of_its_part_f
     assert asked[0] == ((0, 1, 2), 0, False), "the first scene is not refined"
     assert asked[1] == ((0, 1, 2, 3), None, True)
     assert part.entry.views == request.views and set(part.facts.outlines) <= set(request.views)
-
-
-def test_single_views_of_a_tour_are_predicted_by_default_if_the_model_needs_two(
-    monkeypatch, parted_house, load_house, sphere_predictor
-):
-    networks = {"pairs": sphere_predictor(), "default": sphere_predictor()}
-    for (name, network), least in zip(networks.items(), (2, 1), strict=True):
-        network.name, network.min_views = name, least
-        monkeypatch.setitem(models._MODELS, name, lambda network=network: network)
-    monkeypatch.setattr("pansplat.pipeline.load_sets", lambda path, **options: pairs)
-    pairs = [parted_house.make_set(views) for views in ((0, 1), (1, 2), (3,))]
-    pairs[2] = replace(pairs[2], context=(replace(pairs[2].context[0], world=1),))
-    with pytest.warns(InputWarning, match="1 single view is predicted by default"):
-        entries = find_entries(parted_house.folder, ReadOptions(), PredictOptions("pairs"))
-    assert all(any("predicted by default" in note for note in entry.notes) for entry in entries)
-    assert not find_entries(parted_house.folder, ReadOptions(), PredictOptions())[0].notes
-    used = []
-
-    def predict(pair, model, **options):
-        used.append(model.name)
-        return select_views(load_house(scenes.make_entry((0, 1))).scene, range(len(pair.context)))
-
-    monkeypatch.setattr("pansplat.pipeline.predict", predict)
-    scenes = TourScenes(parted_house)
-    for views in ((0, 1), (3,)):
-        load_entry(scenes.make_entry(views), PredictOptions("pairs"))
-    assert used == ["pairs", "default"]
 
 
 @pytest.mark.shared

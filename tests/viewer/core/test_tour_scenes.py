@@ -122,9 +122,8 @@ def test_a_zoom_shows_both_photographs_and_ends_in_that_of_its_goal(parted_house
 
 
 def test_a_wall_that_a_scene_shows_is_no_edge_and_needs_no_other_prediction(house, load_house):
-    first = load_house(
-        SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
-    )
+    first = SceneEntry(house.name, tour=house, pair=house.make_set((0, 1)), views=(0, 1), start=1, max_views=64)
+    first = load_house(first)
     scenes = TourScenes.start(first)
     (part,) = scenes.list_next(None, 0.0)
     loaded = load_house(scenes.make_entry(part))
@@ -179,9 +178,7 @@ def test_predictions_go_on_to_the_last_scene_and_what_was_dropped_is_read_again(
     assert scenes.choose_request(scenes.list_next(None, 0.0), None).views == scenes.views
 
 
-def test_a_way_begins_at_the_camera_and_after_a_jump_at_its_edge_and_zooms_along_edges_without_a_scene(
-    scenes, load_house
-):
+def test_a_way_begins_at_the_camera_and_after_a_jump_at_its_edge_and_zooms_where_there_is_no_scene(scenes, load_house):
     kinds = [step.kind for step in scenes.plan_way(scenes.tour.cam2world[0].numpy(), (2,)).steps]
     assert "flight" in kinds and "zoom" in kinds, "only the scene of the first edge is there"
     for views in ((1, 2), (2, 3)):

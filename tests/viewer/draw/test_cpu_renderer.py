@@ -104,9 +104,7 @@ def test_without_waiting_the_last_image_is_shown_until_the_new_one_is_finished(r
 
     wait_until(render, "image of the new pose")
     renderer.draw_faces(turned, SIZE, SETTINGS)
-    wait_until(
-        lambda: all(renderer.has_faces(each, SIZE, SETTINGS) for each in (pose, turned)), "faces in every direction"
-    )
+    wait_until(lambda: all(renderer.has_faces(each, SIZE, SETTINGS) for each in (pose, turned)), "faces all around")
 
 
 def test_a_worker_without_opengl_draws_the_same_image(renderer, small_scene, pose):

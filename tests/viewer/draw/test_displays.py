@@ -28,9 +28,8 @@ def draw(renderer, pose, settings) -> np.ndarray:
 
 @pytest.mark.parametrize("name", RENDERERS)
 def test_depth_and_opacity_are_the_mapped_numbers_of_the_image(make_renderer, small_scene, pose, name):
-    image = rasterize(
-        small_scene.gaussians.to(dtype=torch.float64), torch.from_numpy(pose), size=SIZE[::-1], layout="pinhole"
-    )
+    gaussians = small_scene.gaussians.to(dtype=torch.float64)
+    image = rasterize(gaussians, torch.from_numpy(pose), size=SIZE[::-1], layout="pinhole")
     for display, values, largest in (("depth", image.depth, 6.0), ("opacity", image.alpha, 1.0)):
         color = draw(make_renderer(small_scene, name), pose, DrawSettings(display=display, display_max=largest))
         expected = map_values(values.numpy(), largest, SCALAR_MAPS[display]) / 255

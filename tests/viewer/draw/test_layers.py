@@ -37,9 +37,7 @@ def drawn(monkeypatch) -> list[int]:
 
 
 @pytest.mark.parametrize(("mode", "color_bits"), [("joint", 16), ("deferred", 32)])
-def test_cached_faces_give_the_image_and_the_depth_of_direct_drawing(
-    make_renderer, random_scene, pose, turn, mode, color_bits
-):
+def test_cached_faces_give_image_and_depth_of_direct_drawing(make_renderer, random_scene, pose, turn, mode, color_bits):
     scene = enlarge_gaussians(random_scene(400, size=0.2))
     kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)
     for degrees in (0, 40, 100, 170, 260):

@@ -25,9 +25,8 @@ RENDERERS = pytest.mark.parametrize("renderer_name", ["gl", "cpu"])
 
 def blur(scene, pose, shift):
     """The scene with Gaussians that are widened by the movement of a camera, in float64."""
-    means, quats, scales = (
-        each.double() for each in (scene.gaussians.means, scene.gaussians.quats, scene.gaussians.scales)
-    )
+    own = scene.gaussians
+    means, quats, scales = (each.double() for each in (own.means, own.quats, own.scales))
     rays = means - torch.from_numpy(pose[:3, 3])
     n = torch.nn.functional.normalize(rays, dim=1)
     axes = rotations_from_quats(quats) * scales[:, None]
@@ -123,15 +122,12 @@ def test_opengl_and_the_processor_draw_the_reference(name, random_scene, pose, a
 
 
 @RENDERERS
-@pytest.mark.parametrize(("unit", "origin"), [(1e-3, (0, 0, 0)), (1e4, (0, 0, 0)), (1, (4e5, -2e5, 1e5))])
-def test_image_does_not_depend_on_the_unit_of_length_and_the_origin(
-    make_renderer, random_scene, pose, unit, origin, renderer_name
-):
+def test_image_does_not_depend_on_the_unit_of_length_and_the_origin(make_renderer, random_scene, pose, renderer_name):
+    unit, origin = 1e3, torch.tensor((4e8, -2e8, 1e8), dtype=torch.float64)
     scene = random_scene(seed=7)
     renderer = make_renderer(scene, renderer_name)
     renderer.render(pose, SIZE, DrawSettings())
     expected = renderer.read_color()
-    origin = torch.tensor(origin, dtype=torch.float64)
     cam2world = scene.cam2world.clone()
     cam2world[:, :3, 3] = cam2world[:, :3, 3] * unit + origin
     gaussians = scene.gaussians.to(dtype=torch.float64)

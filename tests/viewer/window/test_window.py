@@ -41,9 +41,8 @@ class Display:
         read, write = os.pipe()
         # -noreset: otherwise the server restarts, and refuses clients, when its last client (xdotool) disconnects.
         command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-fbdir", str(folder)]
-        self._server = subprocess.Popen(
-            [*command, "-noreset", "-nolisten", "tcp"], pass_fds=(write,), stderr=subprocess.DEVNULL
-        )
+        command += ["-noreset", "-nolisten", "tcp"]
+        self._server = subprocess.Popen(command, pass_fds=(write,), stderr=subprocess.DEVNULL)
         os.close(write)
         with os.fdopen(read) as answer:
             self.name = f":{answer.readline().strip()}"
