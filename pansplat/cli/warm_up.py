@@ -28,7 +28,7 @@ def main() -> None:
     views = Views(images, poses, masks, near=0.1, far=10.0, names=("left", "right"))
     gaussians = predict(views, "default", refine_steps=1, device="cpu").gaussians  # it has all kernels of "sweep"
     shiny = replace(gaussians, harmonics=torch.ones(len(gaussians), 4, 3, requires_grad=True))
-    rasterize(shiny, poses[0], size=(16, 32), layout="pinhole", backend="numba").color.sum().backward()
+    rasterize(shiny, poses[0], size=(16, 32), layout="cubemap", backend="numba").color.sum().backward()
     rasterize(gaussians, poses[0], size=(16, 32), eye_offset=0.03, backend="numba")
     fields = gaussians.means, gaussians.opacities, gaussians.quats, gaussians.scales, gaussians.harmonics
     scene = DisplayScene(*(field.numpy() for field in fields), np.ones(len(gaussians), np.float32))

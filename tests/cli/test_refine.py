@@ -55,10 +55,12 @@ def test_layers_keep_all_gaussians(room: Path, tmp_path: Path, capsys) -> None:
 @pytest.mark.usefixtures("any_state")
 def test_a_scene_is_refined_with_the_photographs_of_its_pair(room: Path, scene: Path, tmp_path: Path) -> None:
     assert refine(room, tmp_path / "pair.ply", "--model", "sphere", "--height", HEIGHT) == 0
+    given = pipeline.load(scene)
     assert refine(scene, tmp_path / "scene.ply", "--photographs", room) == 0
-    scenes = [pipeline.load(tmp_path / f"{name}.ply") for name in ("pair", "scene")]
-    a, b = (pipeline.render(each, each.pose_between(0.5), size=(32, 64)).color for each in scenes)
-    assert (a - b).abs().mean() < 1 / 255  # the file of the given scene is rounded
+    scenes = given, *(pipeline.load(tmp_path / f"{name}.ply") for name in ("pair", "scene"))
+    before, a, b = (pipeline.render(each, each.pose_between(0.5), size=(32, 64)).color for each in scenes)
+    # The file of the given scene is rounded, so that some other Gaussians are split.
+    assert (a - b).abs().mean() < 0.25 * (a - before).abs().mean()
 
 
 def test_a_budget_limits_the_gaussians(room: Path, tmp_path: Path, capsys) -> None:

@@ -103,7 +103,7 @@ def test_pose_errors_are_corrected(room, monkeypatch) -> None:
     )
     views = dataclasses.replace(room.views, cam2world=poses)
     monkeypatch.setattr(module, "_POSE_PENALTY", 1.0)
-    refined, _ = _refine(room, scene=scene, views=views, steps=60, poses=True)
+    refined, _ = _refine(room, scene=scene, views=views, steps=150, poses=True)
 
     def relative_angle(pair: torch.Tensor) -> float:
         rotation = (invert_pose(pair[0]) @ pair[1])[:3, :3]
@@ -317,7 +317,7 @@ def test_a_step_on_a_card_moves_nothing_between_card_and_memory(small_room, join
         with pretend_card() as count:
             moved = dataclasses.replace(scene, gaussians=scene.gaussians.to(device=device))
             refinement = Refinement(moved, small_room.views, RefineConfig())
-            for step in range(6):  # with a split
+            for step in range(3):  # with a split
                 if step == 1:  # the first one finds out which Gaussians a photograph shows
                     count.clear()
                 refinement.step(step / 6)

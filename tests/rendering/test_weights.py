@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from dense_renderer import POSE, make_scene
 
 from pansplat.rendering import rasterize
 from pansplat.rendering.weights import draw_colors, sum_weights
@@ -12,8 +13,13 @@ SIZE = (40, 80)
 
 
 @pytest.fixture
-def scene(make_scene):
+def scene():
     return make_scene(600, scale=0.15, degree=1, seed=1).to(dtype=torch.float32)
+
+
+@pytest.fixture
+def pose():
+    return POSE.clone()
 
 
 def test_sums_of_weights_equal_the_reference(scene, pose):
