@@ -81,6 +81,9 @@ class _FloorPlan:
         """Write the plan and print its rooms."""
         from pansplat.export.plan_files import describe_plan, write_plan
 
+        if export.prediction.options.refine_steps is None:  # a refinement moves walls by less than their uncertainty
+            options = dataclasses.replace(export.prediction.options, refine_steps=0)
+            export = dataclasses.replace(export, prediction=dataclasses.replace(export.prediction, options=options))
         scene, photographs = export.open()
         plan = write_plan(scene, export.out, photographs[0].folder if photographs else None)
         print(f"{export.out}: {'; '.join(describe_plan(plan))}")

@@ -14,6 +14,7 @@ from synthetic_scenes import make_balls, place_cameras, see_box
 from pansplat import pipeline
 from pansplat.cli import export as export_module
 from pansplat.cli import run
+from pansplat.errors import InputError
 from pansplat.export import page as page_module
 from pansplat.gaussians.scene import Gaussians, Scene
 from pansplat.geometry.world import WorldFrame
@@ -162,6 +163,19 @@ def test_a_plan_states_rooms_and_uncertainty(tmp_path: Path, capsys: pytest.Capt
     assert "plan.svg: 1 room, 24.0 m² between the walls; scale: cameras 1.50 m over the floor" in printed
     assert "walls: of one panorama each" in printed
     assert ">Kitchen</text>" in (tmp_path / "plan.svg").read_text()
+
+
+def test_a_plan_is_of_a_scene_that_is_not_refined_unless_asked(room, tmp_path, monkeypatch) -> None:
+    steps = []
+
+    def predict(source, *, options: PredictOptions) -> Scene:
+        steps.append(options.refine_steps)
+        raise InputError("enough")
+
+    monkeypatch.setattr(pipeline, "predict", predict)
+    for name, *stated in (("plan.svg",), ("refined.svg", "--refine", "3"), ("page.html",)):
+        assert run(["export", str(room), "-o", str(tmp_path / name), *stated]) == 2
+    assert steps == [0, 3, None]
 
 
 def test_floaters_are_left_out_and_counted(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
