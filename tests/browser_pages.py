@@ -36,7 +36,7 @@ CLOCK = """((waiting, time) => {
         waiting.splice(0).forEach((onFrame) => onFrame(time));
     };
 })([], 1e5);"""
-FRAME_MS = 30  # of it; the page keeps its resolution
+FRAME_MS = 30  # milliseconds between two frames of the stepped clock; the page lowers its resolution for longer ones
 # Messages to the worker wait while `isHolding`, until `release`.
 HOLD = """
     held = [], isHolding = () => false;
@@ -152,7 +152,7 @@ def decode(url: str) -> Float[np.ndarray, "height width 3"]:
     return np.asarray(image, np.float64) / 255
 
 
-ORIGINS: dict[Path, str] = {}  # of served folders
+ORIGINS: dict[Path, str] = {}  # folder -> http address at which a test serves it
 
 
 def find_address(path: Path) -> str:

@@ -290,10 +290,10 @@ def _describe_scene(
 
 def _describe_plan(facts: TourFacts) -> dict[str, Any]:
     """The floor plan: its drawing, and where the panoramas are on it."""
-    (svg, size, places), rooms = draw_page_plan(facts.plan), facts.plan.rooms
+    svg, size, places = draw_page_plan(facts.plan)
     return {
         "worlds": facts.tour.worlds,
-        "isSure": all(room.is_placed for room in rooms),
+        "isSure": all(room.is_placed for room in facts.plan.rooms),
         "drawing": base64.b64encode(svg).decode(),
         "size": size,
         "places": places,
@@ -330,7 +330,7 @@ def _limit_parts(reaches: Float[np.ndarray, "part"], parts: Sequence[int], flown
     """How far the camera may move in each part from its edges."""
     most = REACH if len(reaches) > 1 else math.inf
     limits = [
-        min(_SINGLE_REACH, 0.5 * reach) if list(parts).count(part) == 1 else min(reach, most)
+        min(_SINGLE_REACH, 0.5 * reach) if parts.count(part) == 1 else min(reach, most)
         for part, reach in enumerate(reaches.tolist())
     ]
     return [limit if part in flown else 0.0 for part, limit in enumerate(limits)]

@@ -73,7 +73,7 @@ def write_files(
     count, names = header["count"], [spot["name"] for spot in header["spots"]]
     labels = label_files(names)
     parts: dict[str, bytes] = {}
-    tags: dict[int, list[str]] = {}  # by view
+    tags: dict[int, list[str]] = {}  # HTML elements of the Gaussians of each view
     for view, content in enumerate(contents):
         ends = [len(content)] if split else [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
         chunks = [content[start:end] for start, end in pairwise((0, *ends))]

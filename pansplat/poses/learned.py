@@ -94,7 +94,7 @@ class LearnedFeatures:
 
 LEAST_COMMON = 18
 """Distinctive descriptors in common of two panoramas of one room: those of other rooms have 10 to 90, all pairs with a
-pose of five real homes 21 or more (docs/poses.md)."""
+pose of four real homes 21 or more (docs/poses.md)."""
 NO_LEARNED = LearnedFeatures(np.empty((0, 3)), torch.empty(0, 128), torch.empty(0, 2), (0,) * (_FACES + 1))
 
 

@@ -42,8 +42,8 @@ class MatchingWeights(NamedTuple):
     color_weight: float = 0.5
     color_truncation: float = 0.15  # mean absolute colour difference at which the colour cost is truncated
     variance_epsilon: float = 4e-4  # added to the variances, so that noise in flat windows has no effect
-    free_space_penalty: float = 0.5  # for a hypothesis in front of the other view's surface
-    consistency_bonus: float = 0.15  # for a hypothesis on the other view's surface
+    free_space_penalty: float = 0.5  # added to the cost of a hypothesis in front of the other view's surface
+    consistency_bonus: float = 0.15  # subtracted from the cost of a hypothesis on the other view's surface
     occluded_cost: float = 0.9  # of a hypothesis behind the other view's surface, where it cannot be matched
     back_facing_cost: float = 0.8  # of a plane between the two cameras: each would see a different side of it
     tolerance: float = 0.08  # relative difference of inverse depth within which two views are consistent

@@ -237,7 +237,7 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
     folder = _folder(tmp_path / "room")
     for name in ("attic.jpg", "cellar.png", ".hidden.png", "left_mask.png", "attic_depth.png"):
         write_scene(folder / name, 8)
-    write_grey(folder / "film_frame.png")  # with the metadata of an own rendering
+    write_grey(folder / "film_frame.png")  # its metadata name pansplat as the software
     with pytest.warns(UserWarning, match=r"poses\.json has no pose of attic\.jpg, cellar\.png; each is a scene"):
         pair, attic, cellar = load_sets(folder)
     assert (pair.name, [view.world for view in pair.context]) == ("room", [0, 0])
@@ -251,7 +251,7 @@ def test_a_panorama_that_poses_do_not_list_is_a_scene_of_its_own(tmp_path: Path,
 def test_pictures_that_poses_name_are_panoramas_whoever_made_them(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "room")
     for name in ("frame.png", "taken.png", "view.png"):
-        write_grey(folder / name)  # with the metadata of an own rendering
+        write_grey(folder / name)  # its metadata name pansplat as the software
     content = json.loads((folder / "poses.json").read_text())
     content |= {"estimate": {"unplaced": {"frame.png": "no door", "taken.png": "bare walls"}}}
     (folder / "poses.json").write_text(json.dumps(content))

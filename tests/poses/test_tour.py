@@ -141,7 +141,8 @@ def test_a_pair_that_contradicts_two_better_ones_is_rejected(changes: dict[str, 
 
 
 def test_the_less_probable_pair_of_a_contradiction_is_rejected() -> None:
-    assert list_kept(stretch=2.0, log_odds=9.0) == [(0, 1), (0, 2)]  # of the others, (1, 2) has the lower score
+    # (0, 2) is the most probable pair; (1, 2) has a lower score than (0, 1), so that it is the one that is dropped.
+    assert list_kept(stretch=2.0, log_odds=9.0) == [(0, 1), (0, 2)]
 
 
 DOUBT = {"problem": "too little in common", "log_odds": -1.0}

@@ -317,7 +317,7 @@ def test_a_step_on_a_card_moves_nothing_between_card_and_memory(small_room, join
         with pretend_card() as count:
             moved = dataclasses.replace(scene, gaussians=scene.gaussians.to(device=device))
             refinement = Refinement(moved, small_room.views, RefineConfig())
-            for step in range(3):  # with a split
+            for step in range(3):  # the third step splits Gaussians
                 if step == 1:  # the first one finds out which Gaussians a photograph shows
                     count.clear()
                 refinement.step(step / 6)

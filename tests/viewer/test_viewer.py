@@ -32,7 +32,6 @@ from pansplat_viewer.viewer import Viewer
 from pansplat_viewer.window.input import FAST, KEYS, SLOW, WALK_SPEED, Input
 
 SIZE = (560, 900)
-CENTER = (0.5, 0.5)
 
 
 class NoRenderer:

@@ -80,7 +80,8 @@ def in_headset(
     with opened(chromium, path, size=(400, 200), script=f"{iwer};{HEADSET};{script}") as page:
         page.run("(head) => setHead(head, 0.2, 0)", head)
         page.run("Object.values(device.controllers).forEach((each) => { each.connected = false; })")
-        page.run("pansplat.render(40, 20).then(() => 0)")  # with a photograph, the page is ready before the Gaussians
+        # A page with photographs is ready before its Gaussians are read; a picture is drawn after that.
+        page.run("pansplat.render(40, 20).then(() => 0)")
         page.page.click("#vr")
         page.wait("frames > 2")
         yield page

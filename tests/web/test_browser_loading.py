@@ -107,7 +107,7 @@ def test_a_room_without_a_flight_shows_its_photograph_only(chromium: Any, folder
         page.run("pansplat.goTo(3), 0")
         page.wait("pansplat.isSettled() && pansplat.camera.position.every((x, i) => x === HEADER.spots[2].position[i])")
         assert page.draw().min() > 0.1, "a photograph, and nothing black"
-        page.run("pansplat.camera.position[0] += 0.3")  # as a headset leaves it
+        page.run("pansplat.camera.position[0] += 0.3")  # metres beside the panorama, as after a headset session
         page.settle()
         assert page.draw().min() > 0.1
         page.run("pansplat.goTo(1), 0")
