@@ -34,7 +34,6 @@ from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
 from pansplat.images.cube_images import DENSE_FACE
 from pansplat.images.image_files import read_face_size
-from pansplat.images.masks import mask_holes
 from pansplat.inputs.content import hash_pixels
 from pansplat.inputs.panorama_sets import PanoramaSet
 from pansplat.system.files import SOFTWARE, make_unique_name
@@ -207,7 +206,7 @@ def load_photograph(
 ) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "height width"]]:
     """The picture of a pair of one panorama, of at most a height, and where it may be shown: 0 in what masks hide."""
     views = photograph.load_context(max(min(height, photograph.image_height), 2))  # faces need two rows
-    image, mask = views.images[0], views.masks[0] & mask_holes(views.images)[0]
+    image, mask = views.images[0], views.shown[0]
     shown = torch.ones(1).expand(mask.shape) if mask.all() else torch.from_numpy(_fade_from_hidden(mask.numpy()))
     return image, shown
 

@@ -48,7 +48,6 @@ _MIN_VIEWS_FOR_LEGS = 4  # with fewer panoramas too many edges are static by cha
 _LEG_RADIUS, _LEG_SHIFT, _LEG_GAP = 5, 5, 7  # samples: half thickness, shift between views, largest interruption
 _LEG_CONTRAST = 0.045  # least grey difference of a leg to the floor
 _REGION_MARGIN = 3  # samples added around the region, because its edge is blurred
-_LEAST_COLOR = 1e-6  # value in [0, 1] that black surfaces get, which are no holes then; less than any display shows
 
 
 def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "height width"]:
@@ -69,34 +68,18 @@ def detect_scene_mask(images: Float[Tensor, "view 3 height width"]) -> Bool[Tens
     return torch.from_numpy(cv2.resize(static, (width, height), interpolation=cv2.INTER_LINEAR) < 0.5)
 
 
-def mask_holes(images: Float[Tensor, "view 3 height width"]) -> Bool[Tensor, "view height width"]:
-    """True for the pixels outside patches of exact black: holes of scans, and caps around the poles.
+def find_holes(image: Float[Tensor, "3 height width"], *, is_scan: bool = False) -> Bool[Tensor, "height width"]:
+    """True in patches of exact black, and where resizing mixed their edges with the scene.
 
-    Black surfaces of photographs are no holes, because `lift_black_surfaces` makes them brighter than exact black.
+    In the rendering of a scan they are holes; in a photograph only those that reach a pole are, because others are
+    black surfaces, such as screens and windows at night.
     """
-    visible = np.empty((len(images), *images.shape[-2:]), bool)
-    for view, image in enumerate(images):
-        visible[view] = cv2.dilate(_black_patches(image), np.ones((5, 5), np.uint8)) == 0
-    return torch.from_numpy(visible)
-
-
-def lift_black_surfaces(image: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
-    """A photograph whose black surfaces, such as screens and windows at night, differ from the exact black of holes.
-
-    Black patches that reach a pole are caps and stay exactly black.
-    """
-    patches = _black_patches(image)
-    if not patches.any():
-        return image
-    _, labels = cv2.connectedComponents(patches)
-    surfaces = (patches > 0) & ~np.isin(labels, labels[[0, -1]])
-    return torch.where(torch.from_numpy(surfaces), image.clamp_min(_LEAST_COLOR), image)
-
-
-def _black_patches(image: Float[Tensor, "3 height width"]) -> NDArray[np.uint8]:
-    """1 in squares of at least 3 x 3 pixels of exact black."""
     black = (image.detach().cpu().numpy().max(axis=0) <= 0).astype(np.uint8)
-    return cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    if not is_scan:
+        labels = cv2.connectedComponents(patches)[1]
+        patches *= np.isin(labels, labels[[0, -1]])
+    return torch.from_numpy(cv2.dilate(patches, np.ones((5, 5), np.uint8)) > 0)
 
 
 def scene_mask_of_files(paths: tuple[Path, ...], height: int) -> Bool[Tensor, "height width"]:

@@ -25,7 +25,7 @@ from pansplat.images.image_files import (
     read_mask,
     read_panorama,
 )
-from pansplat.images.masks import lift_black_surfaces, scene_mask_of_files
+from pansplat.images.masks import find_holes, scene_mask_of_files
 from pansplat.inputs.placements import PLACED, Placement
 from pansplat.inputs.views import Views
 from pansplat.system.descriptions import describe_range, list_first
@@ -188,10 +188,10 @@ class PanoramaSet:
 
     def _load(self, panoramas: tuple[Panorama, ...], height: int) -> Views:
         images = torch.empty(len(panoramas), 3, height, 2 * height)
-        masks = torch.empty(len(panoramas), height, 2 * height, dtype=torch.bool)
+        masks, holes = torch.empty(2, len(panoramas), height, 2 * height, dtype=torch.bool)
         for i, panorama in enumerate(panoramas):
-            image, opaque = read_panorama(panorama.image, height)
-            images[i] = image if panorama.is_scan else lift_black_surfaces(image)
+            images[i], opaque = read_panorama(panorama.image, height)
+            holes[i] = find_holes(images[i], is_scan=panorama.is_scan)
             masks[i] = opaque & read_scene_mask(panorama, self.siblings, height)
             if not masks[i].any():
                 raise InputError(
@@ -211,6 +211,7 @@ class PanoramaSet:
             camera_height=panoramas[0].camera_height if panoramas else CAMERA_HEIGHT,
             depths=torch.stack(depths) if depths and len(depths) == len(panoramas) else None,
             frame=frame,
+            holes=holes if holes.any() else None,
         )
 
 

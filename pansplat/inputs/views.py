@@ -22,7 +22,7 @@ class Views:
     """Panoramas of one place with their poses, all of one size.
 
     Attributes:
-        images: RGB in [0, 1], float32. Patches of exact black show nothing, see `masks.mask_holes`.
+        images: RGB in [0, 1], float32.
         cam2world: float64, OpenCV axes, metres.
         masks: True where a pixel shows the scene; False for what is fixed to the camera (tripod, caps, operator).
         near, far: radial depth range to search, metres.
@@ -30,6 +30,7 @@ class Views:
         depths: radial distance in metres, 0 where unknown; None when the data set has no depth.
         camera_height: over the floor, metres; the scale of a single view.
         frame: where the world of the poses is in the user's world, that of files.
+        holes: True for pixels that show nothing: holes of scans, and black caps around the poles; None without any.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -41,6 +42,12 @@ class Views:
     depths: Float[Tensor, "view height width"] | None = None
     camera_height: float = CAMERA_HEIGHT
     frame: WorldFrame = USER_FRAME
+    holes: Bool[Tensor, "view height width"] | None = None
+
+    @property
+    def shown(self) -> Bool[Tensor, "view height width"]:
+        """True where a pixel shows the scene, outside of masks and holes."""
+        return self.masks if self.holes is None else self.masks & ~self.holes
 
     def __repr__(self) -> str:
         count, _, height, width = self.images.shape
@@ -66,6 +73,7 @@ def select_views(views: Views, indices: Sequence[int]) -> Views:
         masks=views.masks[chosen],
         names=tuple(views.names[i] for i in indices),
         depths=None if views.depths is None else views.depths[chosen],
+        holes=None if views.holes is None else views.holes[chosen],
     )
 
 

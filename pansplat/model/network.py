@@ -215,7 +215,7 @@ def _check_inputs(
             f"`images` must be (view, 3, height, 2 * height), got {shape}; stack RGB equirectangular images of one size"
         )
     require_views(shape[0], compat)
-    require_matching_inputs(images, cam2world, masks)
+    require_matching_inputs(images, cam2world, masks=masks)
     if near.numel() not in (1, shape[0]) or far.numel() not in (1, shape[0]):
         raise InputError(
             f"`near` and `far` must be one number, or one number per view, got {near.tolist()} and {far.tolist()}"

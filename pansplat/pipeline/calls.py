@@ -179,4 +179,5 @@ def _as_tensors(views: Views) -> Views:
             f"`images` must be RGB in [0, 1], got values up to {float(images.max()):g}; divide them by 255"
         )
     poses = torch.as_tensor(views.cam2world, dtype=torch.float64)
-    return replace(views, images=images, masks=masks, cam2world=poses)
+    holes = None if views.holes is None else torch.as_tensor(views.holes, dtype=torch.bool)
+    return replace(views, images=images, masks=masks, cam2world=poses, holes=holes)

@@ -267,7 +267,8 @@ def _predict_views(task: Task) -> Scene:
     content = cached.read()
     if content is None:
         views = task.views
-        gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks)
+        holes = {"holes": views.holes} if getattr(predictor, "takes_holes", False) else {}
+        gaussians = predictor(views.images, views.cam2world, views.near, views.far, masks=views.masks, **holes)
         assert isinstance(gaussians, Gaussians)  # a list would be the result of a batch
         content = CachedScene(gaussians)
         cached.write(content)

@@ -32,7 +32,6 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gains, Gaussians, Scene
 from pansplat.geometry.equirect import row_weights
 from pansplat.geometry.pose import interpolate_poses, nearest_views
-from pansplat.images.masks import mask_holes
 from pansplat.inputs.views import Views
 from pansplat.refinement.adam import ParameterGroup
 from pansplat.refinement.budget import DROP_ERROR, MAX_OTHERS, drop_unseen, merge_to
@@ -129,8 +128,7 @@ class Refinement:
 
     Args:
         scene: with one input camera for each of the views.
-        views: the photographs that the scene was predicted from, of any size. Masked pixels and the holes of scans are
-            not compared.
+        views: the photographs that the scene was predicted from, of any size. Only what is `shown` is compared.
         config: settings.
         seed: seed of the choice of held-out blocks.
     """
@@ -147,7 +145,7 @@ class Refinement:
         device, random = scene.gaussians.means.device, torch.Generator().manual_seed(seed)
         self._images = views.images.float().to(device)
         self._masks = views.masks.to(device)
-        compared = (views.masks & mask_holes(views.images)).to(device)
+        compared = views.shown.to(device)
         limit, height = self.config.gaussians, min(self._images.shape[-2], DISPLAY_HEIGHT)
         self._size = (height, 2 * height)
         self._contribution_size = (min(height, _CONTRIBUTION_HEIGHT), 2 * min(height, _CONTRIBUTION_HEIGHT))

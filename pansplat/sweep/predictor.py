@@ -14,7 +14,6 @@ from pansplat.errors import InputError
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.equirect import fit_panoramas
 from pansplat.geometry.world import require_working_world
-from pansplat.images.masks import mask_holes
 from pansplat.inputs.panorama_sets import MAX_CONTEXT
 from pansplat.predictor import require_matching_inputs, select_item
 from pansplat.rendering.color_fit import fit_colors
@@ -41,6 +40,7 @@ class Sweep:
     """Largest number of views of a prediction, whose time grows linearly: a view is matched against a few others."""
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
+    takes_holes = True
 
     def __init__(
         self, config: SearchConfig | None = None, prior: NetworkPrior | None = None, name: str = "sweep"
@@ -62,21 +62,22 @@ class Sweep:
         far: float | Tensor,
         *,
         masks: Bool[Tensor, "*batch view height width"] | None = None,
+        holes: Bool[Tensor, "*batch view height width"] | None = None,
     ) -> Gaussians | list[Gaussians]:
         """Predict from RGB in [0, 1] and OpenCV cam2world poses (metres); a list when there is a batch axis.
 
         Args:
             near, far: radial depth range, metres: numbers, or tensors with one value for each batch item or view; the
                 range then covers all views.
-            masks: True where a pixel shows the scene. Other pixels are not matched and have no Gaussians. Patches of
-                exact black (0, 0, 0), the holes of scans, are masked too.
+            masks: True where a pixel shows the scene. Other pixels are not matched and have no Gaussians.
+            holes: True where a scan, or a black cap, shows nothing; masked too.
         """
         if images.ndim == 5:
             bounds = [[select_item(bound, n) for n in range(len(images))] for bound in (near, far)]
-            item_masks = [None] * len(images) if masks is None else masks
-            items = zip(images, cam2world, *bounds, item_masks, strict=True)
+            item_masks = ([None] * len(images) if stated is None else stated for stated in (masks, holes))
+            items = zip(images, cam2world, *bounds, *item_masks, strict=True)
             return [self._predict(*item) for item in items]
-        return self._predict(images, cam2world, near, far, masks)
+        return self._predict(images, cam2world, near, far, masks, holes)
 
     def _predict(
         self,
@@ -85,15 +86,17 @@ class Sweep:
         near: float | Tensor,
         far: float | Tensor,
         masks: Tensor | None,
+        holes: Tensor | None,
     ) -> Gaussians:
         low, high = float(torch.as_tensor(near).min()), float(torch.as_tensor(far).max())
-        _check_inputs(images, cam2world, low, high, masks)
-        images, masks = fit_panoramas(images, masks, _HEIGHT_MULTIPLE)
-        # Holes of scans are not matched, but fitted, so that Gaussians beside a hole do not reach into it; in a single
-        # view, whose background layer continues there, they are not.
+        _check_inputs(images, cam2world, low, high, masks=masks, holes=holes)
         given = torch.ones(images[:, 0].shape, dtype=torch.bool) if masks is None else masks.cpu()
-        matched = given & mask_holes(images)
+        # Holes are not matched, but fitted, so that Gaussians beside a hole do not reach into it; in a single view,
+        # whose background layer continues there, they are not.
+        matched = given if holes is None else given & ~holes.cpu()
         fitted = matched if len(images) == 1 else given
+        _, fitted = fit_panoramas(images, fitted, _HEIGHT_MULTIPLE)
+        images, matched = fit_panoramas(images, matched, _HEIGHT_MULTIPLE)
         posed = PosedImages(
             images=np.ascontiguousarray(images.detach().cpu().float().permute(0, 2, 3, 1).numpy()),
             cam2world=cam2world.detach().cpu().double().numpy(),
@@ -117,12 +120,12 @@ class Sweep:
         return gaussians.to(device=images.device)
 
 
-def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, masks: Tensor | None) -> None:
+def _check_inputs(images: Tensor, cam2world: Tensor, near: float, far: float, **masks: Tensor | None) -> None:
     shape = tuple(images.shape)
     if images.ndim != 4 or shape[0] < 1 or shape[1] != 3 or shape[3] != 2 * shape[2]:
         raise InputError(
             f"`images` must be (view, 3, height, 2 * height) of at least one panorama, got {shape}; "
             "stack RGB equirectangular images of one size"
         )
-    require_matching_inputs(images, cam2world, masks)
+    require_matching_inputs(images, cam2world, **masks)
     require_working_world(cam2world, near, far)

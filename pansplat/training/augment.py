@@ -57,9 +57,9 @@ def mirror_views(views: Views) -> Views:
 
 
 def _replace_maps(views: Views, change: Callable[[Tensor], Tensor], cam2world: Float[Tensor, "view 4 4"]) -> Views:
-    """The views with changed images, masks and depths, and with other poses."""
-    depths = None if views.depths is None else change(views.depths)
-    return replace(views, images=change(views.images), masks=change(views.masks), depths=depths, cam2world=cam2world)
+    """The views with changed images, masks, depths and holes, and with other poses."""
+    maps = {name: getattr(views, name) for name in ("images", "masks", "depths", "holes")}
+    return replace(views, cam2world=cam2world, **{n: None if m is None else change(m) for n, m in maps.items()})
 
 
 def _sample_colour_change(

@@ -10,7 +10,7 @@ import torch
 
 from pansplat.geometry.equirect import pixel_directions, row_weights
 from pansplat.images.image_files import write_image
-from pansplat.images.masks import detect_scene_mask, mask_holes, scene_mask_of_files
+from pansplat.images.masks import detect_scene_mask, find_holes, scene_mask_of_files
 from pansplat.inputs.folders import load_sets
 
 _HEIGHT = 128
@@ -104,19 +104,14 @@ def test_only_the_tripod_of_zind_is_masked(shared: Path) -> None:
     assert math.isclose(float(pair.load_context(64).masks.float().mean()), float(scene.float().mean()), abs_tol=0.01)
 
 
-def test_patches_of_exact_black_are_holes_of_a_scan() -> None:
-    images = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0)).clamp_min(0.1)
-    images[0, :, 20:30, 40:60] = 0
-    masks = torch.ones(2, 64, 128, dtype=torch.bool)
-    masks[0, 18:32, 38:62] = False  # the hole, and the pixels that resizing mixes with it
-    assert torch.equal(mask_holes(images), masks)
-
-
-def test_dark_patches_and_single_black_pixels_are_no_holes() -> None:
-    images = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(0)).clamp_min(0.1)
-    images[0, :, 20:30, 40:60] = 1e-3
-    images[0, :, 5, 5] = 0
-    assert mask_holes(images).all()
+def test_patches_of_exact_black_are_holes_of_a_scan_and_dark_ones_or_single_pixels_are_none() -> None:
+    image = torch.rand(3, 64, 128, generator=torch.Generator().manual_seed(0)).clamp_min(0.1)
+    image[:, 20:30, 40:60] = 0
+    image[:, 40:50, 40:60] = 1e-3
+    image[:, 5, 5] = 0
+    holes = torch.zeros(64, 128, dtype=torch.bool)
+    holes[18:32, 38:62] = True  # the hole, and the pixels that resizing mixes with it
+    assert torch.equal(find_holes(image, is_scan=True), holes)
 
 
 @pytest.mark.parametrize("is_scan", [False, True])
@@ -136,8 +131,8 @@ def test_only_scans_have_holes_inside_the_picture(tmp_path: Path, is_scan: bool)
         content = {"convention": "cam2world opencv", "poses": poses}
         (tmp_path / "poses.json").write_text(json.dumps(content))
     views = load_sets(tmp_path)[0].load_context(64)
-    visible = mask_holes(views.images)
-    assert not visible[:, 58:].any()
-    assert torch.equal(visible[:, 20:30, 40:60], torch.full((2, 10, 20), not is_scan))
-    assert visible[:, :18].all()
+    assert not views.shown[:, 58:].any()
+    assert torch.equal(views.shown[:, 20:30, 40:60], torch.full((2, 10, 20), not is_scan))
+    assert views.shown[:, :18].all()
+    assert views.masks.all()
     assert torch.allclose(views.images[0], image, atol=3e-3)

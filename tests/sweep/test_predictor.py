@@ -83,16 +83,16 @@ def test_swapping_the_views_swaps_their_labels(small, predicted):
 
 
 @pytest.mark.slow
-def test_holes_of_a_scan_are_masked_and_the_input_is_not_changed(small):
-    holed, poses = small[0].clone(), small[1].clone()
-    holed[0, :, 20:30, 40:60] = 0
-    masks = torch.ones(2, 64, 128, dtype=torch.bool)
-    masks[0, 18:32, 38:62] = False  # the hole, and the pixels that resizing mixes with it
-    inputs = holed.clone(), poses.clone(), masks.clone()
-    found, given = Sweep()(holed, poses, 0.5, 8.0), Sweep()(holed, poses, 0.5, 8.0, masks=masks)
-    # Colours are fitted to the pixels of a hole that is found, and not to those of a given mask.
-    assert _same(dataclasses.replace(found, harmonics=given.harmonics), given)
-    assert all(torch.equal(a, b) for a, b in zip(inputs, (holed, poses, masks), strict=True))
+def test_holes_are_masked_but_fitted_and_the_input_is_not_changed(small):
+    images, poses = small[0].clone(), small[1].clone()
+    holes = torch.zeros(2, 64, 128, dtype=torch.bool)
+    holes[0, 18:32, 38:62] = True
+    images[holes[:, None].expand_as(images)] = 0
+    inputs = images.clone(), poses.clone(), holes.clone()
+    holed, masked = (Sweep()(images, poses, 0.5, 8.0, **mask) for mask in ({"holes": holes}, {"masks": ~holes}))
+    assert _same(dataclasses.replace(holed, harmonics=masked.harmonics), masked)
+    assert not torch.equal(holed.harmonics, masked.harmonics)
+    assert all(torch.equal(a, b) for a, b in zip(inputs, (images, poses, holes), strict=True))
 
 
 @pytest.mark.parametrize(
