@@ -26,22 +26,6 @@ def write_depth_image(path: Path, millimetres: int) -> None:
     cv2.imwrite(str(path), np.full((16, 32), millimetres, np.uint16))
 
 
-@pytest.fixture(scope="session")
-def write_panorama() -> Callable[..., None]:
-    return write_grey
-
-
-@pytest.fixture(scope="session")
-def write_depth() -> Callable[..., None]:
-    return write_depth_image
-
-
-@pytest.fixture(scope="session")
-def matrix() -> Callable[..., list[list[float]]]:
-    """A cam2world matrix at x."""
-    return lambda x: [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-
-
 def color_directions(rays: np.ndarray) -> np.ndarray:
     """8-bit colours of directions (... 3): right, up, forward."""
     unit = rays / np.linalg.norm(rays, axis=-1, keepdims=True)

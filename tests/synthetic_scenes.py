@@ -1,8 +1,9 @@
-"""Gaussians for tests: round or flat ones at given places, the walls of a box room that a camera sees; and a bound."""
+"""Gaussians for tests: round or flat ones at given places, the walls of a box room that a camera sees; poses, noise."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor
 from pansplat.gaussians.harmonics import SH_0
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import fibonacci_directions
+from pansplat.geometry.pose import rotations_from_quats
 
 
 def make_balls(
@@ -63,6 +65,17 @@ def place_cameras(*places: tuple[float, float, float]) -> Float[Tensor, "view 4 
     poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
     poses[:, :3, 3] = torch.tensor(places, dtype=torch.float64)
     return poses
+
+
+def turn_camera(quat: Sequence[float] | Tensor, place: tuple[float, float, float]) -> Float[Tensor, "4 4"]:
+    """The pose of a camera with this rotation."""
+    (pose,) = place_cameras(place)
+    pose[:3, :3] = rotations_from_quats(torch.as_tensor(quat, dtype=torch.float64))
+    return pose
+
+
+def draw_noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def approx_of_8_bits(decibels: float) -> Any:

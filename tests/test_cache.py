@@ -134,12 +134,9 @@ def test_an_interrupted_refinement_is_not_cached(pair_folder: Path, sphere_predi
 
 
 @pytest.mark.parametrize("steps", [-1, 2.5, float("nan"), True])
-def test_an_invalid_number_of_steps_of_the_refinement_is_refused(pair_folder: Path, sphere_predictor, steps) -> None:
-    expect_error("`refine_steps`", lambda: predict(pair_folder, sphere_predictor(), height=HEIGHT, refine_steps=steps))
-
-
-def test_an_invalid_limit_of_gaussians_is_refused_before_the_prediction(pair_folder: Path, sphere_predictor) -> None:
+def test_invalid_numbers_of_a_refinement_are_refused_before_a_prediction(pair_folder, sphere_predictor, steps) -> None:
     predictor = sphere_predictor()
+    expect_error("`refine_steps`", predict, pair_folder, predictor, height=HEIGHT, refine_steps=steps)
     expect_error("`gaussians`", predict, pair_folder, predictor, height=HEIGHT, refine_steps=8, gaussians=0)
     assert predictor.calls == 0
 

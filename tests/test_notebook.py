@@ -50,14 +50,9 @@ def open_picture(bundle: dict) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(bundle["image/jpeg"]))))
 
 
-def open_page(bundle: dict) -> str:
-    (source,) = re.findall(r'srcdoc="([^"]+)"', bundle["text/html"])
-    return html.unescape(source)
-
-
 def test_a_scene_is_the_page_in_a_frame_with_a_picture_and_the_size(scene: Scene) -> None:
     bundle = display(scene)
-    page = open_page(bundle)
+    page = html.unescape(re.findall(r'srcdoc="([^"]+)"', bundle["text/html"])[0])
     assert page.startswith("<!doctype html>")
     assert 'sandbox="allow-scripts' in bundle["text/html"] and "allow-same-origin" not in bundle["text/html"]
     assert f"400 of 400 Gaussians, {len(page) / 1e6:.1f} MB" in bundle["text/html"]

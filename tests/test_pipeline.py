@@ -240,15 +240,6 @@ def test_render_refuses_an_unknown_blend_and_conflicting_drawing_options(scene: 
         expect_error("`drawing`|sets all|`blend` must be", render, scene, scene.pose_between(0.5), **options)
 
 
-def test_a_saved_scene_renders_the_same_image(scene: Scene, tmp_path: Path) -> None:
-    save(scene, tmp_path / "scene.ply")
-    back = load(tmp_path / "scene.ply")
-    pose = scene.pose_between(0.3)
-    before, after = render(scene, pose), render(back, pose)
-    torch.testing.assert_close(after.color, before.color, atol=1e-5, rtol=0)
-    torch.testing.assert_close(after.depth, before.depth, atol=1e-4, rtol=0)
-
-
 TILED_HEIGHT = 64
 
 

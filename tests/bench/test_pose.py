@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
+from synthetic_scenes import place_cameras
 
 from pansplat.bench import pose as bench
 from pansplat.cli import run
@@ -17,12 +17,6 @@ from pansplat.inputs.panorama_sets import Panorama
 from pansplat.poses.estimate import PoseEstimate, PoseGroup
 from pansplat.poses.solvers import rotation_exp
 from pansplat.poses.two_view import RelativePose
-
-
-def _panoramas() -> list[Panorama]:
-    poses = [torch.eye(4, dtype=torch.float64) for _ in range(3)]
-    poses[1][0, 3], poses[2][2, 3] = 1.0, 2.0
-    return [Panorama(str(n), Path(f"{n}.jpg"), pose) for n, pose in enumerate(poses)]
 
 
 def _estimate(panoramas: list[Panorama], turn: float) -> PoseEstimate:
@@ -43,7 +37,8 @@ def _estimate(panoramas: list[Panorama], turn: float) -> PoseEstimate:
 
 @pytest.mark.parametrize(("turn", "outcome"), [(0.0, "solved"), (0.1, "wrong")])
 def test_errors_do_not_depend_on_the_world(monkeypatch: pytest.MonkeyPatch, turn: float, outcome: str) -> None:
-    panoramas = _panoramas()
+    poses = place_cameras((0, 0, 0), (1, 0, 0), (0, 0, 2))
+    panoramas = [Panorama(str(n), Path(f"{n}.jpg"), pose) for n, pose in enumerate(poses)]
     monkeypatch.setattr(bench, "estimate_poses", lambda images, camera_height: _estimate(panoramas, turn))
     row = bench.measure_poses("room", panoramas, 1.5, "tour")
     assert row.get("outcome") == outcome

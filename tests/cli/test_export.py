@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat import pipeline
@@ -43,13 +42,12 @@ def test_exports_are_in_the_unit_and_at_the_place_of_the_poses(scene, tmp_path, 
     pipeline.save(dataclasses.replace(metres, frame=frame), given)
     assert run(["export", str(given), "-o", str(points), "--points", "--layers"]) == 0
     header, body = points.read_bytes().split(b"end_header\n")
-    kind = "<f8" if any(frame.origin) else "<f4"
-    assert (b"property double x" in header) == any(frame.origin)
-    table = np.frombuffer(body, [("position", kind, 3), ("color", "u1", 3)])
+    assert b"property double x" in header, "an origin needs float64"
+    table = np.frombuffer(body, [("position", "<f8", 3), ("color", "u1", 3)])
     colors = 255 * (0.5 + 0.28209479 * metres.gaussians.harmonics[:, 0].numpy())
     assert np.abs(table["color"] - colors.clip(0, 255)).max() <= 0.51
     expected = frame.globalize_places(metres.gaussians.means)
-    assert np.allclose(table["position"], expected, rtol=1e-6 if kind == "<f4" else 0, atol=1e-6 * frame.unit)
+    assert np.allclose(table["position"], expected, rtol=0, atol=1e-6 * frame.unit)
     corners = frame.globalize_places(torch.tensor(((-9.0, -9, -9), (0.5, 9, 9)))).flatten().tolist()
     assert run(["export", str(given), "-o", str(points), "--layers", "--crop", *map(str, corners)]) == 0
     assert run(["export", str(scene), "-o", str(scene), "--layers", "--crop", *["-9"] * 3, "0.5", "9", "9"]) == 0
@@ -62,27 +60,17 @@ def test_exports_are_in_the_unit_and_at_the_place_of_the_poses(scene, tmp_path, 
     assert f"got ({x:.2f}, 0.00, 0.00) to ({x + 1:.2f}, 1.00, 1.00) m and a scene from" in message
     assert run(["info", str(given)]) == 0
     shown = capsys.readouterr().out
-    assert f"near {0.45 * frame.unit:g} m" in shown and ("origin          at (" in shown) == any(frame.origin)
+    assert f"near {0.45 * frame.unit:g} m" in shown and "origin          at (" in shown
     assert run(["export", str(given), "-o", str(tmp_path / "scene.splat"), "--layers"]) == 0
-    assert ("positions are relative to (" in capsys.readouterr().err) == any(frame.origin)
+    assert "positions are relative to (" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("suffix", [".sog", ".glb"])
-def test_every_format_is_described_drawn_and_opened(scene, tmp_path, suffix: str, capsys) -> None:
+def test_every_format_is_described_and_opened(scene, tmp_path, suffix: str, capsys) -> None:
     out = tmp_path / f"out{suffix}"
     assert run(["export", str(scene), "-o", str(out), "--layers"]) == 0
     assert run(["info", str(out)]) == 0
     assert "1,024 Gaussians, SH degree 0" in capsys.readouterr().out
-    images = []
-    for number, path in enumerate((scene, out)):
-        arguments = ["render", str(path), "-o", str(tmp_path / f"{number}.png"), "--height", "16", "--blend", "joint"]
-        pose = tmp_path / "pose.json"
-        pose.write_text("[[1, 0, 0, 0.31], [0, 1, 0, 0.17], [0, 0, 1, 0.23], [0, 0, 0, 1]]")  # no equal distances
-        assert run([*arguments, "--pose", str(pose)]) == 0
-        with Image.open(tmp_path / f"{number}.png") as image:
-            images.append(np.asarray(image).astype(float))
-    error = np.mean((images[0] - images[1]) ** 2)
-    assert 10 * np.log10(255**2 / max(error, 1e-9)) > 36
     (entry,) = find_entries(out, ReadOptions(), PredictOptions())
     assert entry.file == out
 
@@ -92,15 +80,18 @@ def test_a_page_of_panoramas_shows_them_and_a_crop_does_not(tmp_path, write_tour
     command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
     for _ in range(2):  # a page of ours is replaced
         assert run([*command, str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert f"{out / 'index.html'} and 22 files in index_files/" in printed and "3 photographs of 64 rows" in printed
-    assert '"folder": "index_files"' in (out / "index.html").read_text()
+    printed = capsys.readouterr()
+    assert f"{out / 'index.html'} and 22 files in index_files/" in printed.out
+    assert "a tour of 3 panoramas" in printed.err
+    assert "3 photographs of 64 rows" in printed.out and '"folder": "index_files"' in (out / "index.html").read_text()
+    assert '"edges": [[0, 1, 0], [1, 2, 1]]' in (out / "index.html").read_text()
     for options in (["--photo-height", "0"], ["--crop", "-9", "-9", "-9", "9", "9", "9"]):
         assert run([*command, str(tmp_path / "page.html"), *options]) == 0
         assert '"photographs": []' in (tmp_path / "page.html").read_text()
     assert "without photographs, which would show what is left out" in capsys.readouterr().err
     (out / "index.html").write_text("mine")
     assert "index.html" in refusal(*command, out), "a page of another program stays"
+    assert "needed a scene file" in refusal(*command, tmp_path / "house.glb"), "predict makes scenes"
 
 
 @pytest.mark.parametrize(("stated", "title"), [({"title": "Our <home>"}, "Our &lt;home&gt;"), ({}, "Villa St. Moritz")])
@@ -114,15 +105,6 @@ def test_the_page_of_a_web_tour_has_its_title_or_the_name_of_its_folder(stated, 
     assert f"<title>{title}</title>" in out.read_text() and '"text": "a lamp"' in out.read_text()
     assert run(["export", str(tour), "-o", str(out), *options, "--title", "Our home"]) == 0
     assert "<title>Our home</title>" in out.read_text()
-
-
-def test_a_folder_of_three_panoramas_is_exported_as_a_tour(tmp_path, write_tour, capsys, refusal) -> None:
-    house = write_tour(tmp_path / "house", height=64)
-    command = ["export", str(house), "--model", "sphere", "--refine", "0", "--predict-height", "64", "-o"]
-    assert run([*command, str(tmp_path / "house.html")]) == 0
-    assert "a tour of 3 panoramas" in capsys.readouterr().err
-    assert '"edges": [[0, 1, 0], [1, 2, 1]]' in (tmp_path / "house.html").read_text()
-    assert "needed a scene file" in refusal(*command, tmp_path / "house.glb"), "predict makes scenes"
 
 
 def test_a_pair_is_merged_to_the_limit_of_its_page_before_its_refinement(tmp_path, write_tour, capsys, monkeypatch):

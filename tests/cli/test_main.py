@@ -215,7 +215,7 @@ def test_a_name_that_is_no_text_is_refused_with_its_bytes(tmp_path: Path, write_
     folder = write_pair(tmp_path / "pair")
     odd = os.fsdecode(b"caf\xe9.png")
     shutil.copy(folder / "left.png", folder / odd)
-    for path in (folder, folder / odd):
-        assert run(["check", str(path)]) == 2
+    for command, path in (("check", folder), ("pose", folder), ("check", folder / odd)):
+        assert run([command, str(path)]) == 2
         err = capsys.readouterr().err
         assert "caf\\udce9" in err and "needed a name in UTF-8, got other bytes; rename" in err and err.count("\n") == 1

@@ -113,14 +113,10 @@ def linked(request: pytest.FixtureRequest, folder: Path, write_tiles) -> Path:
     return tour
 
 
-def _export(folder: Path, out: Path) -> object:
-    return run(["export", str(folder), "-o", str(out / "tour.html"), "--model", "sphere"])
-
-
 CALLERS = {
     "pose": lambda folder, out: run(["pose", str(folder), "-o", str(folder / "poses.json")]),
     "pose of a tour's file": lambda folder, out: run(["pose", *map(str, folder.glob("*.html"))]),
-    "export": _export,
+    "export": lambda folder, out: run(["export", str(folder), "-o", str(out / "tour.html"), "--model", "sphere"]),
     "pansplat.predict": lambda folder, out: pansplat.predict(folder),
     "the window": lambda folder, out: find_entries(folder, ReadOptions(), PredictOptions()),
 }

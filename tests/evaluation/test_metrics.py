@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from synthetic_scenes import place_cameras, turn_camera
 
 from pansplat.evaluation.metrics import cross_fade, distortion, psnr, ssim, ws_psnr
 from pansplat.geometry.equirect import pixel_directions, row_weights
-from pansplat.geometry.pose import rotations_from_quats
 
 METRICS = {"psnr": psnr, "ws_psnr": ws_psnr, "ssim": ssim}
 
@@ -80,13 +80,6 @@ def test_images_and_masks_that_do_not_fit_are_refused(unchecked: None) -> None:
         ssim(image[:, :10], image[:, :10])
 
 
-def pose_at(x: float, quat: tuple[float, ...] = (1, 0, 0, 0)) -> torch.Tensor:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
-    pose[0, 3] = x
-    return pose
-
-
 def render_sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
     """A panorama of smooth colours at infinity."""
     directions = pixel_directions(height, 2 * height, dtype=torch.float64) @ pose[:3, :3].T
@@ -94,8 +87,8 @@ def render_sky(pose: torch.Tensor, height: int = 64) -> torch.Tensor:
 
 
 def test_the_cross_fade_is_exact_for_a_scene_at_infinity() -> None:
-    poses = [pose_at(0, (0.9, 0.2, 0.4, -0.1)), pose_at(1, (0.3, -0.8, 0.1, 0.5))]
-    target = pose_at(0.3, (0.7, 0.1, -0.6, 0.3))
+    poses = [turn_camera((0.9, 0.2, 0.4, -0.1), (0, 0, 0)), turn_camera((0.3, -0.8, 0.1, 0.5), (1, 0, 0))]
+    target = turn_camera((0.7, 0.1, -0.6, 0.3), (0.3, 0, 0))
     faded = cross_fade(torch.stack([render_sky(p) for p in poses]), torch.stack(poses), target)
     assert float((faded - render_sky(target)).abs().max()) < 5e-3  # bilinear sampling
 
@@ -103,7 +96,7 @@ def test_the_cross_fade_is_exact_for_a_scene_at_infinity() -> None:
 def test_the_cross_fade_weights_inputs_by_distance() -> None:
     images = torch.stack((torch.zeros(3, 8, 16), torch.ones(3, 8, 16)))
     for place in (0.0, 0.25):
-        faded = cross_fade(images, torch.stack((pose_at(0), pose_at(1))), pose_at(place))
+        faded = cross_fade(images, place_cameras((0, 0, 0), (1, 0, 0)), *place_cameras((place, 0, 0)))
         torch.testing.assert_close(faded, torch.full((3, 8, 16), place), atol=1e-5, rtol=0)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from refusals import expect_error
+from synthetic_scenes import place_cameras, turn_camera
 
 from pansplat.evaluation.pose_check import (
     _ADVICE,
@@ -17,19 +18,12 @@ from pansplat.evaluation.pose_check import (
     check_views,
 )
 from pansplat.geometry.equirect import pixel_directions
-from pansplat.geometry.pose import invert_pose, rotations_from_quats
+from pansplat.geometry.pose import invert_pose
 from pansplat.inputs.folders import load_sets
 from pansplat.inputs.views import Views
 
 _FLIP = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
 _HEIGHT = 40
-
-
-def _pose(quat: tuple[float, ...], centre: tuple[float, ...]) -> torch.Tensor:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(torch.tensor(quat, dtype=torch.float64))
-    pose[:3, 3] = torch.tensor(centre, dtype=torch.float64)
-    return pose
 
 
 def _render_room(cam2world: torch.Tensor) -> torch.Tensor:
@@ -51,7 +45,10 @@ def _views(*poses: torch.Tensor, near: float = 0.45, far: float = 10.0) -> Views
     return Views(images, torch.stack(poses), masks.bool(), near, far, tuple("abc"[: len(poses)]))
 
 
-_TILTED = (_pose((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)), _pose((0.6, -0.15, -0.6, 0.1), (-0.5, -0.2, 0.5)))
+_TILTED = (
+    turn_camera((0.9, 0.1, 0.3, 0.05), (0.4, 0.2, -0.3)),
+    turn_camera((0.6, -0.15, -0.6, 0.1), (-0.5, -0.2, 0.5)),
+)
 
 
 def _make_mistakes(poses: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -60,7 +57,7 @@ def _make_mistakes(poses: torch.Tensor) -> dict[str, torch.Tensor]:
     turned[:, :3, :3] = poses[:, :3, :3].transpose(-1, -2)
     robot = torch.eye(4, dtype=torch.float64)  # columns: forward, left and up in OpenCV's axes
     robot[:3, :3] = torch.tensor(((0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)))
-    quarter = _pose((0.5**0.5, 0.0, 0.5**0.5, 0.0), (0.0, 0.0, 0.0))
+    quarter = turn_camera((0.5**0.5, 0.0, 0.5**0.5, 0.0), (0.0, 0.0, 0.0))
     return {
         "inverse": invert_pose(poses),
         "opengl axes": poses @ _FLIP,
@@ -102,11 +99,8 @@ def test_a_nearly_perfect_fit_or_an_interpretation_that_stands_out_little_is_no_
     assert _describe_mistake(errors | {"opengl axes": 0.490, "swapped views": 0.499}) is not None
 
 
-_SIDE_BY_SIDE = (_pose((1, 0, 0, 0), (0, 0, 0)), _pose((1, 0, 0, 0), (0.8, 0, 0)))
-
-
 def test_interpretations_with_the_same_relative_pose_are_indistinguishable_and_named_together() -> None:
-    views = _views(*_SIDE_BY_SIDE)
+    views = _views(*place_cameras((0, 0, 0), (0.8, 0, 0)))
     check = check_views(views)
     assert _best(check) == AS_GIVEN
     assert {"opengl axes", "mirrored up-down", "transposed rotation"} <= set(check.indistinguishable)

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from panorama_fixtures import write_grey
+from panorama_formats import move
 from PIL import Image
 from rich.console import Console
 from synthetic_scenes import approx_of_8_bits
@@ -158,11 +160,11 @@ def test_a_refined_scene_is_evaluated_with_its_time_and_error_at_the_inputs(tmp_
     assert "at inputs" in headings and "refine s" in headings
 
 
-def test_the_documented_script_states_the_papers_pairs_of_360loc(tmp_path, write_panorama, monkeypatch) -> None:
+def test_the_documented_script_states_the_papers_pairs_of_360loc(tmp_path, monkeypatch) -> None:
     """docs/evaluation.md: the official inputs, targets and range, and without detection of what moves with a camera."""
     for frame in range(120):
-        write_panorama(tmp_path / "image" / f"{frame}.png", frame / 120)
-    poses = {f"{frame}.png": [[1, 0, 0, 0.2 * frame], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for frame in range(120)}
+        write_grey(tmp_path / "image" / f"{frame}.png", frame / 120)
+    poses = {f"{frame}.png": move(0.2 * frame) for frame in range(120)}
     (tmp_path / "camera_pose.json").write_text(json.dumps(poses))
     Image.new("L", (16, 8), 255).save(tmp_path / "mask.png")
     text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from panorama_formats import write_posed
 from PIL import Image
 
 from pansplat.cli import run
@@ -17,11 +18,8 @@ from pansplat.inputs.folders import load_panoramas
 
 def _write_folder(folder: Path, names: dict[str, int], links: dict[str, object] | None = None) -> None:
     """Grey panoramas with poses."""
-    folder.mkdir()
-    for name, grey in names.items():
-        Image.fromarray(np.full((64, 128, 3), grey, np.uint8)).save(folder / name)
-    poses = {name: [[1, 0, 0, k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for k, name in enumerate(names)}
-    (folder / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+    pictures = {name: np.full((64, 128, 3), grey, np.uint8) for name, grey in names.items()}
+    write_posed(folder, pictures, range(len(names)))
     if links:
         (folder / "links.json").write_text(json.dumps(links))
 

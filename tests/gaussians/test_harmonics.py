@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import sph_harm_y
+from synthetic_scenes import draw_noise
 
 from pansplat.gaussians.harmonics import evaluate_harmonics, harmonics_basis, rotate_harmonics
 from pansplat.geometry.pose import rotations_from_quats
 
 
-def _random(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def _directions(count: int, seed: int = 0) -> torch.Tensor:
-    return torch.nn.functional.normalize(_random(count, 3, seed=seed), dim=-1)
+    return torch.nn.functional.normalize(draw_noise(count, 3, seed=seed), dim=-1)
 
 
 def test_basis_equals_scipys_with_the_sign_of_3dgs():
@@ -34,14 +31,14 @@ def test_basis_equals_scipys_with_the_sign_of_3dgs():
 
 def test_colour_is_differentiable_in_coefficients_and_direction():
     directions = _directions(3, seed=1).requires_grad_()
-    harmonics = (0.1 * _random(3, 25, 3, seed=2)).requires_grad_()
+    harmonics = (0.1 * draw_noise(3, 25, 3, seed=2)).requires_grad_()
     assert torch.autograd.gradcheck(evaluate_harmonics, (harmonics, directions))
 
 
 @pytest.mark.parametrize("degree", range(5))
 def test_rotated_harmonics_have_the_same_colours_in_rotated_directions(degree: int):
-    rotation = rotations_from_quats(_random(4))
-    harmonics = _random((degree + 1) ** 2, 3, seed=1)
+    rotation = rotations_from_quats(draw_noise(4))
+    harmonics = draw_noise((degree + 1) ** 2, 3, seed=1)
     directions = _directions(40, seed=2)
     before = harmonics_basis(directions, degree) @ harmonics
     after = harmonics_basis(directions @ rotation.T, degree) @ rotate_harmonics(harmonics, rotation)
@@ -49,7 +46,7 @@ def test_rotated_harmonics_have_the_same_colours_in_rotated_directions(degree: i
 
 
 def test_rotation_keeps_the_dtype_and_passes_gradcheck():
-    harmonics, rotation = _random(2, 25, 3), rotations_from_quats(_random(4))
+    harmonics, rotation = draw_noise(2, 25, 3), rotations_from_quats(draw_noise(4))
     assert rotate_harmonics(harmonics.float(), rotation).dtype == torch.float32
     given = harmonics.requires_grad_(), rotation.requires_grad_()
     assert torch.autograd.gradcheck(rotate_harmonics, given, fast_mode=True)

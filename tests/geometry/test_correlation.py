@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from synthetic_scenes import draw_noise
 
 from pansplat.geometry import correlation
 from pansplat.geometry.correlation import correlate
@@ -15,25 +16,21 @@ SAMPLINGS = ("sphere", "corners")
 H, W = 8, 16
 
 
-def _noise(*shape, seed=0):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def _inverse_depth(*shape):
     return 0.05 + 2 * torch.rand(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
 
 def _poses(count, baseline=0.5):
     poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
-    poses[:, :3, :3] = rotations_from_quats(_noise(count, 4, seed=1))
-    poses[:, :3, 3] = baseline * _noise(count, 3, seed=2)
+    poses[:, :3, :3] = rotations_from_quats(draw_noise(count, 4, seed=1))
+    poses[:, :3, 3] = baseline * draw_noise(count, 3, seed=2)
     return poses
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("height", [8, 30, 64])
 def test_identity_pose_warps_to_identity(height, dtype):
-    maps = _noise(1, 3, height, 2 * height).to(dtype)
+    maps = draw_noise(1, 3, height, 2 * height).to(dtype)
     inverse_depth = _inverse_depth(1, 4, height, 2 * height).to(dtype)
     warped = warp_panorama(maps, inverse_depth, torch.eye(4)[None])
     error = (warped - maps[:, :, None]).abs().max()
@@ -44,7 +41,7 @@ def test_identity_pose_warps_to_identity(height, dtype):
 
 
 def test_a_warp_samples_the_panorama_at_the_projected_point():
-    maps, inverse_depth, poses = _noise(2, 3, H, W), _inverse_depth(2, 4, H, W), _poses(2)
+    maps, inverse_depth, poses = draw_noise(2, 3, H, W), _inverse_depth(2, 4, H, W), _poses(2)
     points = pixel_directions(H, W, dtype=torch.float64) / inverse_depth[..., None]
     points = torch.einsum("nij,ndhwj->ndhwi", poses[:, :3, :3], points) + poses[:, None, None, None, :3, 3]
     truth = torch.stack([sample_equirect(image, uv_from_directions(p)) for image, p in zip(maps, points, strict=True)])
@@ -78,8 +75,8 @@ def _truth(reference, other, inverse_depth, pose, sampling):
 
 def _inputs(channels=5, candidates=7, height=H):
     return (
-        _noise(2, channels, height, 2 * height, seed=5),
-        _noise(2, channels, height, 2 * height, seed=6),
+        draw_noise(2, channels, height, 2 * height, seed=5),
+        draw_noise(2, channels, height, 2 * height, seed=6),
         _inverse_depth(2, candidates, height, 2 * height),
         _poses(2),
     )

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from synthetic_scenes import draw_noise
 
 from pansplat.geometry.equirect import (
     directions_from_uv,
@@ -16,10 +17,6 @@ from pansplat.geometry.equirect import (
     uv_from_directions,
 )
 from pansplat.geometry.pose import rotations_from_quats
-
-
-def _noise(*shape):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
 def _uv(height, width, margin=0):
@@ -66,7 +63,7 @@ def test_row_weights_are_the_solid_angle_of_the_rows():
 
 
 def test_a_quarter_turn_to_the_right_rolls_the_panorama_left():
-    image = _noise(3, 8, 16)
+    image = draw_noise(3, 8, 16)
     turn = rotations_from_quats(torch.tensor((math.cos(math.pi / 4), 0, math.sin(math.pi / 4), 0), dtype=torch.float64))
     assert torch.allclose(turn[:, 2], torch.tensor((1.0, 0, 0), dtype=torch.float64), atol=1e-12)
     assert torch.allclose(rotate_equirect(image, turn), image.roll(-4, dims=-1), atol=1e-9)
@@ -80,7 +77,7 @@ def test_padding_continues_the_directions_of_a_panorama(margin):
 
 
 def test_wrapped_columns_have_zeros_beyond_the_poles():
-    maps = _noise(2, 3, 4, 8)
+    maps = draw_noise(2, 3, 4, 8)
     padded = pad_equirect(maps, 2, "wrapped_columns")
     assert padded.shape == (2, 3, 8, 12)
     assert not padded[..., :2, :].any() and not padded[..., -2:, :].any()
@@ -99,13 +96,13 @@ def test_a_margin_larger_than_the_map_is_refused(border, shape):
 
 @pytest.mark.parametrize("height", [16, 12, 8, 6, 4, 2, 5])
 def test_resizing_samples_the_sphere_at_the_new_pixel_centres(height):
-    maps = _noise(2, 3, 8, 16)
+    maps = draw_noise(2, 3, 8, 16)
     truth = torch.stack([sample_equirect(image, _uv(height, 2 * height)) for image in maps])
     assert torch.allclose(resize_equirect(maps, (height, 2 * height)), truth, atol=1e-12)
 
 
 def test_padding_and_resizing_pass_gradcheck():
-    maps = _noise(1, 2, 4, 8).requires_grad_()
+    maps = draw_noise(1, 2, 4, 8).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: pad_equirect(x, 2, "sphere"), maps)
     assert torch.autograd.gradcheck(lambda x: pad_equirect(x, 2, "wrapped_columns"), maps)
     assert torch.autograd.gradcheck(lambda x: resize_equirect(x, (6, 12)), maps)

@@ -17,11 +17,6 @@ def _pose(position=(0.0, 0.0, 0.0), rotation=None) -> torch.Tensor:
     return pose
 
 
-def _rotation_z(degrees: float) -> list[list[float]]:
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return [[c, -s, 0], [s, c, 0], [0, 0, 1]]
-
-
 TWO = torch.stack((_pose((1, 2, 3)), _pose((4, 2, 3))))
 
 
@@ -39,7 +34,8 @@ def test_look_pose_refuses_a_direction_along_up():
 
 def test_level_pose_has_no_roll_and_keeps_the_heading():
     up = torch.tensor((0.0, -1, 0))
-    rolled = _pose((1, 1, 1), _rotation_z(20))
+    c, s = math.cos(math.radians(20)), math.sin(math.radians(20))
+    rolled = _pose((1, 1, 1), [[c, -s, 0], [s, c, 0], [0, 0, 1]])
     assert torch.allclose(level_pose(rolled, up), _pose((1, 1, 1)), atol=1e-12)
 
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from synthetic_scenes import draw_noise, turn_camera
 
 from pansplat.geometry.pose import (
     interpolate_poses,
@@ -16,19 +17,8 @@ from pansplat.geometry.pose import (
 )
 
 
-def _quats(count: int) -> torch.Tensor:
-    return torch.randn(count, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-
-
-def _pose(quat: torch.Tensor, centre: tuple[float, float, float]) -> torch.Tensor:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(quat)
-    pose[:3, 3] = torch.tensor(centre)
-    return pose
-
-
 def test_rotations_are_orthonormal_and_do_not_depend_on_the_quaternions_length_and_sign():
-    q = _quats(50)
+    q = draw_noise(50, 4)
     rotations = rotations_from_quats(q)
     identity = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
     assert torch.allclose(rotations @ rotations.transpose(1, 2), identity, atol=1e-12)
@@ -37,7 +27,7 @@ def test_rotations_are_orthonormal_and_do_not_depend_on_the_quaternions_length_a
 
 
 def test_rotations_are_converted_back_to_their_quaternions():
-    q = torch.nn.functional.normalize(_quats(200), dim=1)
+    q = torch.nn.functional.normalize(draw_noise(200, 4), dim=1)
     half_turns = torch.eye(4, dtype=torch.float64)[1:]
     for quats in (q, half_turns):
         again = quats_from_rotations(rotations_from_quats(quats))
@@ -46,18 +36,18 @@ def test_rotations_are_converted_back_to_their_quaternions():
 
 
 def test_the_product_of_quaternions_is_the_product_of_rotations():
-    a, b = _quats(20), _quats(40)[20:]
+    a, b = draw_noise(20, 4), draw_noise(20, 4, seed=1)
     product = rotations_from_quats(multiply_quats(a, b))
     assert torch.allclose(product, rotations_from_quats(a) @ rotations_from_quats(b), atol=1e-12)
 
 
 def test_a_pose_times_its_inverse_is_the_identity():
-    pose = _pose(_quats(1)[0], (1.0, -2.0, 3.0))
+    pose = turn_camera(draw_noise(4), (1.0, -2.0, 3.0))
     assert torch.allclose(pose @ invert_pose(pose), torch.eye(4, dtype=torch.float64), atol=1e-12)
 
 
 def test_the_orthonormal_error_of_rigid_scaled_mirrored_and_invalid_poses():
-    pose = _pose(_quats(1)[0], (1.0, 2.0, 3.0))
+    pose = turn_camera(draw_noise(4), (1.0, 2.0, 3.0))
     assert orthonormal_error(pose) < 1e-12
     scaled = pose.clone()
     scaled[:3, :3] *= 1.1
@@ -71,9 +61,9 @@ def test_the_orthonormal_error_of_rigid_scaled_mirrored_and_invalid_poses():
 
 
 def test_interpolation_starts_and_ends_at_the_poses_on_the_shortest_arc():
-    a = _pose(torch.tensor((1.0, 0, 0, 0), dtype=torch.float64), (0.0, 0, 0))
+    a = turn_camera((1.0, 0, 0, 0), (0.0, 0, 0))
     angle = math.radians(100)
-    b = _pose(-torch.tensor((math.cos(angle / 2), 0, math.sin(angle / 2), 0), dtype=torch.float64), (2.0, 0, 0))
+    b = turn_camera((-math.cos(angle / 2), 0, -math.sin(angle / 2), 0), (2.0, 0, 0))
     assert torch.allclose(interpolate_poses(a, b, 0.0), a) and torch.allclose(interpolate_poses(a, b, 1.0), b)
     middle = interpolate_poses(a, b, 0.5)
     assert middle[:3, 3].tolist() == [1, 0, 0]

@@ -118,8 +118,7 @@ def test_nan_is_never_written(tmp_path: Path, name: str) -> None:
 
 def test_unsupported_content_is_not_written(tmp_path: Path) -> None:
     expect_error(r"needed a name ending in", lambda: write_image(tmp_path / "a.gif", _panorama()))
-    with pytest.raises(InputError, match=r"a\.png.*needed an \.exr"):
-        write_image(tmp_path / "a.png", _panorama(), depth=torch.ones(16, 32))
+    expect_error(r"a\.png.*needed an \.exr", write_image, tmp_path / "a.png", _panorama(), depth=torch.ones(16, 32))
     with pytest.raises(InputError, match=r"\(16, 32\), got shape \(8, 8\)"):
         write_image(tmp_path / "a.exr", _panorama(), depth=torch.ones(8, 8))
     expect_error("got shape", lambda: write_image(tmp_path / "a.png", torch.zeros(16, 32)))

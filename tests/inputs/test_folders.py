@@ -33,10 +33,6 @@ def _folder(folder: Path, names: Sequence[str] = ("left.png", "right.png"), **co
     return folder
 
 
-def _centres(pair) -> list[float]:
-    return [float(panorama.cam2world[0, 3]) for panorama in pair.context]
-
-
 def test_two_images_with_poses_are_a_pair(tmp_path: Path) -> None:
     (pair,) = load_sets(_folder(tmp_path / "room"))
     assert pair.name == "room"
@@ -90,18 +86,14 @@ def test_a_pair_has_depth_masks_range_and_targets(tmp_path: Path) -> None:
     (folder / "pairs.json").write_text(json.dumps({"pairs": [{"context": [names[0], names[2]], "target": [names[1]]}]}))
     (pair,) = load_sets(folder)  # targets, masks and depth are no scenes of their own
     views, targets = pair.load_context(16), pair.load_targets(16)
-    assert (views.near, views.far) == (0.2, 30.0)
+    (stated,) = load_sets(folder, near=0.3, far=4)
+    assert (views.near, views.far) == (0.2, 30.0) and (stated.near, stated.far) == (0.3, 4)
     assert views.depths is not None
     assert views.depths[:, 0, 0].tolist() == [1.0, 3.0]
     assert targets.names == ("middle",)
     assert not views.masks[0, 8:].any()
     assert views.masks[0, :8].all()
     assert views.masks[1].all()
-
-
-def test_near_and_far_arguments_override_the_file(tmp_path: Path) -> None:
-    (pair,) = load_sets(_folder(tmp_path / "room", near=1, far=2), near=0.3, far=4)
-    assert (pair.near, pair.far) == (0.3, 4)
 
 
 def test_pairs_of_nested_folders_have_unique_names(tmp_path: Path) -> None:
@@ -140,19 +132,15 @@ def test_triplets_come_first_and_contexts_are_unique(tmp_path: Path) -> None:
     assert [(pair.name, [t.name for t in pair.targets]) for pair in loaded] == [("a-c", ["b"]), ("a-b", [])]
 
 
-def _matterport3d(scene: Path) -> Path:
+def test_panogrf_scenes_are_found_from_every_level_of_folders(tmp_path: Path) -> None:
+    top = tmp_path / "mp3d"
+    scene = top / "png_render_test_32x16_seq_len_3_m3d_dist_0.5" / "00000007"
     for i in range(3):
         view = scene / f"{i:02d}"
         write_grey(view / "rgb.png")
         write_depth_image(view / "depth.png", 2500)
         np.savetxt(view / "rot.txt", np.eye(3))
         np.savetxt(view / "tran.txt", [0, 0.5, 0.5 * (i - 1)])
-    return scene
-
-
-def test_panogrf_scenes_are_found_from_every_level_of_folders(tmp_path: Path) -> None:
-    top = tmp_path / "mp3d"
-    scene = _matterport3d(top / "png_render_test_32x16_seq_len_3_m3d_dist_0.5" / "00000007")
     for path in (top, scene.parent, scene):
         (pair,) = load_sets(path)
         assert pair.name == "00000007"
@@ -162,13 +150,6 @@ def test_panogrf_scenes_are_found_from_every_level_of_folders(tmp_path: Path) ->
     assert views.depths.unique().tolist() == [2.5]
     # Habitat's identity, in a z-up world: right is +x, down is -z, forward is +y (docs/official.md, section 2.1).
     assert views.cam2world[0].tolist() == [[1, 0, 0, 0], [0, 0, 1, 0.5], [0, -1, 0, 0.5], [0, 0, 0, 1]]
-
-
-def _sequence(folder: Path, count: int = 3) -> list[str]:
-    names = [f"{i:04d}.png" for i in range(count)]
-    for name in names:
-        write_grey(folder / "image" / name)
-    return names
 
 
 @pytest.mark.parametrize(
@@ -329,8 +310,9 @@ def test_pairs_of_panoramas_without_a_pose_are_left_out_with_a_note(tmp_path: Pa
 
 
 def test_360loc_sequences_pair_frames_and_others_are_scenes_of_their_own(tmp_path: Path, write_scene) -> None:
-    names = _sequence(tmp_path)
-    (tmp_path / "camera_pose.json").write_text(json.dumps({name: _pose(i) for i, name in enumerate(names)}))
+    for i in range(3):
+        write_grey(tmp_path / "image" / f"{i}.png")
+    (tmp_path / "camera_pose.json").write_text(json.dumps({f"{i}.png": _pose(i) for i in range(3)}))
     write_scene(tmp_path / "image" / "lost.jpg", 8)
     write_scene(tmp_path / "loose.jpg", 8)
     with (
@@ -338,7 +320,8 @@ def test_360loc_sequences_pair_frames_and_others_are_scenes_of_their_own(tmp_pat
         pytest.warns(UserWarning, match=r"panoramas are left out, .*: loose\.jpg; open"),
     ):
         pairs = load_sets(tmp_path)
-    assert [_centres(pair) for pair in pairs[:2]] == [[0, 1], [1, 2]] and pairs[0].far == 50
+    assert [[float(view.cam2world[0, 3]) for view in pair.context] for pair in pairs[:2]] == [[0, 1], [1, 2]]
+    assert pairs[0].far == 50
     _check_single_view(pairs[2], "lost", 1)
 
 
@@ -398,13 +381,3 @@ def test_a_web_tour_is_found_before_folders_below(tmp_path: Path, write_scene) -
         (pair,) = load_sets(path)
         assert pair.name == tmp_path.name and pair.context[0].label == "Hall"
     assert find_panorama_folders(tmp_path) == [tmp_path]
-
-
-@pytest.mark.shared
-def test_zind_has_its_triplets_first(shared: Path) -> None:
-    pairs = load_sets(shared / "data" / "zind")
-    assert [pair.name for pair in pairs[:3]] == ["pano_10-pano_12", "pano_07-pano_11", "pano_04-pano_10"]
-    assert [len(pair.targets) for pair in pairs] == [1] * 3 + [0] * 19
-    assert (pairs[0].near, pairs[0].far) == (0.45, 10.0)
-    baseline = (pairs[0].context[0].cam2world - pairs[0].context[1].cam2world)[:3, 3].norm()
-    assert float(baseline) == pytest.approx(2.545, abs=1e-3)

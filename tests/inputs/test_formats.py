@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -160,10 +161,6 @@ def state_mask(folder: Path, names: list[str], key: str = "mask") -> None:
     (folder / "poses.json").write_text(json.dumps(content))
 
 
-def state_depth(folder: Path, names: list[str]) -> None:
-    state_mask(folder, names, "depth")
-
-
 def state_frame_mask(folder: Path, names: list[str]) -> None:
     state_nerfstudio(folder, names[:2])
     content = json.loads((folder / "transforms.json").read_text())
@@ -171,8 +168,11 @@ def state_frame_mask(folder: Path, names: list[str]) -> None:
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
+STATES = state_poses, state_mask, partial(state_mask, key="depth"), state_loc360, state_frame_mask
+
+
 @pytest.mark.parametrize("outside", ["../secret.png", "{}/secret.png"])
-@pytest.mark.parametrize("state", [state_poses, state_mask, state_depth, state_loc360, state_frame_mask])
+@pytest.mark.parametrize("state", STATES)
 def test_lists_that_lead_out_of_their_folder_are_refused(room: Path, state: State, outside: str) -> None:
     state(room, [*NAMES, outside.format(room.parent)])
     expect_error(OUTSIDE, read, room)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from panorama_fixtures import write_grey
 from PIL import Image
 
 from pansplat.images.image_files import read_panorama
@@ -45,9 +46,9 @@ def test_a_picture_with_other_data_behind_it_is_whole(tmp_path: Path, write_scen
     assert len(load_panoramas(tmp_path)) == 1
 
 
-def test_own_renderings_count_only_if_there_is_nothing_else(tmp_path: Path, write_panorama, write_scene) -> None:
+def test_own_renderings_count_only_if_there_is_nothing_else(tmp_path: Path, write_scene) -> None:
     for name in ("out.png", "out_2.jpg"):
-        write_panorama(tmp_path / name)
+        write_grey(tmp_path / name)
     Image.new("RGB", (20, 20)).save(tmp_path / "logo.png")
     with pytest.warns(UserWarning, match=r"logo\.png: needed a 2:1"):
         assert [panorama.name for panorama in load_panoramas(tmp_path)] == ["out", "out_2"]

@@ -5,32 +5,21 @@ import math
 import pytest
 import torch
 from refusals import expect_error
+from synthetic_scenes import turn_camera
 
 from pansplat.errors import InputError
-from pansplat.geometry.pose import rotations_from_quats
 from pansplat.inputs.poses import CONVENTIONS, parse_convention, rigid_matrix, to_cam2world
 
-_QUAT = torch.tensor((0.7, 0.3, -0.5, 0.4), dtype=torch.float64)
-
-
-def _pose() -> torch.Tensor:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotations_from_quats(_QUAT)
-    pose[:3, 3] = torch.tensor((1.0, -2.0, 0.5))
-    return pose
-
-
-def _in_convention(cam2world: torch.Tensor, convention: str) -> torch.Tensor:
-    """The matrix that a user of the convention would have for an OpenCV cam2world pose."""
-    flip = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
-    own = cam2world @ flip if convention.endswith("opengl") else cam2world
-    return torch.linalg.inv(own) if convention.startswith("world2cam") else own
+POSE = turn_camera((0.7, 0.3, -0.5, 0.4), (1.0, -2.0, 0.5))
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_every_convention_gives_the_same_camera(convention: str) -> None:
-    matrix = rigid_matrix(_in_convention(_pose(), convention).tolist(), "test")
-    assert torch.allclose(to_cam2world(matrix, convention), _pose(), atol=1e-12)
+    flip = torch.diag(torch.tensor((1.0, -1.0, -1.0, 1.0), dtype=torch.float64))
+    own = POSE @ flip if convention.endswith("opengl") else POSE
+    stated = torch.linalg.inv(own) if convention.startswith("world2cam") else own
+    matrix = rigid_matrix(stated.tolist(), "test")
+    assert torch.allclose(to_cam2world(matrix, convention), POSE, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -62,18 +51,18 @@ def test_unknown_conventions_are_refused_with_the_valid_names(text) -> None:
 
 
 def test_a_pose_may_have_three_rows() -> None:
-    assert torch.equal(rigid_matrix(_pose()[:3].tolist(), "test"), _pose())
+    assert torch.equal(rigid_matrix(POSE[:3].tolist(), "test"), POSE)
 
 
 def test_rounded_files_give_exact_rotations() -> None:
-    rounded = (_pose() * 1e3).round() / 1e3
+    rounded = (POSE * 1e3).round() / 1e3
     rotation = rigid_matrix(rounded.tolist(), "test")[:3, :3]
     assert (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-12
-    assert (rotation - _pose()[:3, :3]).abs().max() < 1e-3
+    assert (rotation - POSE[:3, :3]).abs().max() < 1e-3
 
 
 def _changed(**entries: float) -> list:
-    pose = _pose()
+    pose = POSE.clone()
     for key, value in entries.items():
         pose[int(key[1]), int(key[2])] = value
     return pose.tolist()
@@ -88,9 +77,9 @@ def _changed(**entries: float) -> list:
         (_changed(m03=math.inf), "NaN or infinite"),
         (_changed(m00=3.0), "no rotation"),
         (_changed(m33=2.0), "bottom row"),
-        (_pose().T.tolist(), "transposed"),
-        ((_pose() @ torch.diag(torch.tensor((1.0, 1.0, -1.0, 1.0), dtype=torch.float64))).tolist(), "mirrored"),
-        ((_pose() @ torch.diag(torch.tensor((2.0, 2.0, 2.0, 1.0), dtype=torch.float64))).tolist(), "scaled by 2"),
+        (POSE.T.tolist(), "transposed"),
+        ((POSE @ torch.diag(torch.tensor((1.0, 1.0, -1.0, 1.0), dtype=torch.float64))).tolist(), "mirrored"),
+        ((POSE @ torch.diag(torch.tensor((2.0, 2.0, 2.0, 1.0), dtype=torch.float64))).tolist(), "scaled by 2"),
     ],
 )
 def test_matrices_that_are_not_rigid_are_refused_with_the_reason(values, message: str) -> None:

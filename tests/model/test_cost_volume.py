@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from synthetic_scenes import draw_noise
 
 from pansplat.geometry.warp import warp_panorama
 from pansplat.model.cost_volume import (
@@ -18,17 +19,17 @@ from pansplat.model.cost_volume import (
 _SMALL = CostVolumeConfig(mono_channels=3, levels=(SweepLevel(2, 8, 6, 32), SweepLevel(1, 4, 4, 32)))
 
 
-def _noise(*shape, seed=3, dtype=torch.float64):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
 def _inputs(views=2, batch=1):
     """Features of two levels and one that is not used, poses, bounds and monocular features."""
     poses = torch.eye(4, dtype=torch.float64).repeat(batch, views, 1, 1)
-    poses[..., :3, 3] = 0.5 * _noise(batch, views, 3)
-    features = [_noise(batch, views, 8, 8, 16), _noise(batch, views, 4, 16, 32), _noise(batch, views, 2, 32, 64)]
+    poses[..., :3, 3] = 0.5 * draw_noise(batch, views, 3)
+    features = [
+        draw_noise(batch, views, 8, 8, 16),
+        draw_noise(batch, views, 4, 16, 32),
+        draw_noise(batch, views, 2, 32, 64),
+    ]
     bounds = (torch.full((batch, views), depth, dtype=torch.float64) for depth in (0.5, 10.0))
-    return features, poses, *bounds, _noise(batch, views, 3, 16, 32)
+    return features, poses, *bounds, draw_noise(batch, views, 3, 16, 32)
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +92,9 @@ def test_equal_bounds_give_that_depth(small):
     assert all(torch.allclose(depth, torch.tensor(2.0).double(), rtol=1e-12) for depth in depths.depth)
 
 
-def _candidates(near=0.5, far=10.0, count=6):
-    return make_first_candidates((torch.full((1, 2), 1 / far), torch.full((1, 2), 1 / near)), count, (8, 16))
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_logits_choose_one_candidate_or_their_mean_in_float32(dtype):
-    candidates = _candidates()
+    candidates = make_first_candidates((torch.full((1, 2), 0.1), torch.full((1, 2), 2.0)), 6, (8, 16))
     logits = torch.full((1, 2, 6, 8, 16), -1e4, dtype=dtype)
     logits[:, :, 4] = 1e4
     level = regress_depth(2, logits.requires_grad_(), candidates)

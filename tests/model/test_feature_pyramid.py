@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from refusals import expect_error
+from synthetic_scenes import draw_noise
 
 from pansplat.model.feature_pyramid import (
     FeaturePyramid,
@@ -15,10 +16,6 @@ from pansplat.model.feature_pyramid import (
 )
 
 _SMALL = FeaturePyramidConfig(channels=(8, 8, 8, 16), transformer=TransformerConfig(16, blocks=2, expansion=1))
-
-
-def _noise(*shape):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
 
 
 @pytest.mark.parametrize(
@@ -44,6 +41,6 @@ def test_fixed_shift_mask_wraps_at_the_seam_but_not_at_the_poles():
 
 def test_a_repeated_view_changes_nothing(randomize):
     network = randomize(Transformer(TransformerConfig(channels=16, blocks=1, expansion=2), "fixed"))
-    maps = _noise(1, 2, 16, 4, 8)
+    maps = draw_noise(1, 2, 16, 4, 8)
     twice = network(torch.cat((maps, maps[:, 1:]), dim=1))
     assert torch.allclose(twice[:, 0], network(maps)[:, 0], atol=1e-12)

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from refusals import expect_error
+from synthetic_scenes import draw_noise
 
 from pansplat.gaussians.scene import Gaussians
 from pansplat.geometry.fibonacci import lattice_size
@@ -22,10 +23,6 @@ from pansplat.training.network import build_auxiliary_heads
 
 SMALL = HeadsConfig(feature_channels=(6, 5, 4, 3), candidates=4, adapter=AdapterConfig(degree=1))
 _FIELDS = ("means", "scales", "quats", "opacities", "harmonics")
-
-
-def _random(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def _heads(compat="fixed", **changes: object) -> GaussianHeads:
@@ -81,7 +78,7 @@ def test_official_tiles_change_the_output():
 def test_a_tile_computed_alone_has_the_same_gaussians_and_gradients():
     heads, matched = _heads(), _matched()
     untiled = heads(matched)[0]
-    weights = _random(*untiled.means.shape, seed=3)
+    weights = draw_noise(*untiled.means.shape, seed=3)
     (untiled.means * weights).sum().backward()
     expected = [parameter.grad.clone() for parameter in heads.parameters()]
     heads.zero_grad()

@@ -65,8 +65,7 @@ def test_values_that_are_not_finite_are_refused(recipe_weights: dict[str, Tensor
     name = "backbone.decoder.inner1.bias"
     broken = recipe_weights[name].clone()
     broken[3] = torch.nan
-    with pytest.raises(InputError, match=f"got NaN or infinity in {name}"):
-        convert_tensors(as_lightning(recipe_weights | {name: broken}), "x")
+    expect_error(f"got NaN or infinity in {name}", convert_tensors, as_lightning(recipe_weights | {name: broken}), "x")
 
 
 def test_half_precision_weights_become_float32(recipe_weights: dict[str, Tensor], as_lightning: Wrap) -> None:

@@ -4,19 +4,16 @@ import math
 
 import pytest
 import torch
+from synthetic_scenes import draw_noise
 from torch.nn import functional
 
 from pansplat.geometry.fibonacci import lattice_size
 from pansplat.model.tiles import crop_window, make_lattice_uv, make_tiles, move_points
 
 
-def _random(*shape: int) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("height", [8, 32, 128])
 def test_an_official_window_wraps_columns_and_has_zero_rows(height):
-    source = _random(3, 32, 64)
+    source = draw_noise(3, 32, 64)
     resized = functional.interpolate(source[None], (height, 2 * height), mode="bilinear", align_corners=False)[0]
     whole = functional.pad(torch.cat((resized[..., -3:], resized, resized[..., :3]), dim=-1), (0, 0, 3, 3))
     for tile in make_tiles(2):

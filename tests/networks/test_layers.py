@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from refusals import expect_error
+from synthetic_scenes import draw_noise
 
 from pansplat.networks.layers import (
     PanoramaConv2d,
@@ -17,16 +18,12 @@ from pansplat.networks.layers import (
 )
 
 
-def _noise(*shape):
-    return torch.randn(shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-
-
 @pytest.mark.parametrize(("stride", "columns"), [(1, 3), (2, 6)])
 @pytest.mark.parametrize("kernel", [1, 3, 7])
 @pytest.mark.parametrize("compat", ["official", "fixed"])
 def test_rolling_a_panorama_rolls_its_convolution(compat, kernel, stride, columns):
     conv = PanoramaConv2d(2, 3, kernel, stride=stride, border=choose_border(compat)).double()
-    maps = _noise(1, 2, 8, 16)
+    maps = draw_noise(1, 2, 8, 16)
     assert torch.allclose(conv(maps.roll(columns, -1)), conv(maps).roll(columns // stride, -1), atol=1e-14)
     assert conv(maps).shape[-2:] == (8 // stride, 16 // stride)
 
@@ -35,9 +32,9 @@ def test_rolling_a_panorama_rolls_its_convolution(compat, kernel, stride, column
 def test_convolve_and_normalize_equals_both_layers(randomize, bias):
     conv, norm = PanoramaConv2d(3, 4, 3, border="sphere", bias=bias), torch.nn.BatchNorm2d(4)
     randomize(torch.nn.ModuleList((conv, norm)))
-    norm.running_mean.copy_(_noise(4))
-    norm.running_var.copy_(_noise(4).square())
-    maps = _noise(2, 3, 4, 8)
+    norm.running_mean.copy_(draw_noise(4))
+    norm.running_var.copy_(draw_noise(4).square())
+    maps = draw_noise(2, 3, 4, 8)
     assert torch.allclose(convolve_and_normalize(conv, norm, maps), norm(conv(maps)), atol=1e-13)
     norm.train()
     result = convolve_and_normalize(conv, norm, maps)
@@ -45,23 +42,19 @@ def test_convolve_and_normalize_equals_both_layers(randomize, bias):
 
 
 def test_resizing_wraps_at_the_seam_in_fixed_mode_only():
-    maps = _noise(1, 2, 8, 16)
+    maps = draw_noise(1, 2, 8, 16)
     for compat, wraps in (("fixed", True), ("official", False)):
         resized, rolled = resize(maps, (16, 32), compat), resize(maps.roll(8, -1), (16, 32), compat)
         assert torch.allclose(rolled, resized.roll(16, -1), atol=1e-12) == wraps
 
 
-def _softmax_attention(queries, keys, values, mask):
-    logits = queries @ keys.transpose(-1, -2) / math.sqrt(queries.shape[-1]) + mask
-    return logits.softmax(dim=-1) @ values
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_attention_is_a_softmax_of_scaled_products(dtype):
-    queries, keys, values = _noise(3, 2, 4, 6, 32).to(dtype)
-    mask = _noise(1, 4, 6, 6).to(dtype)
+    queries, keys, values = draw_noise(3, 2, 4, 6, 32).to(dtype)
+    mask = draw_noise(1, 4, 6, 6).to(dtype)
     mask[..., ::2, :3] = -math.inf
-    truth = _softmax_attention(*(t.double() for t in (queries, keys, values, mask)))
+    logits = queries.double() @ keys.double().transpose(-1, -2) / math.sqrt(32) + mask.double()
+    truth = logits.softmax(dim=-1) @ values.double()
     result = attend(queries, keys, values, mask=mask)
     assert result.dtype == dtype
     assert (result - truth).abs().max() < (1e-5 if dtype == torch.float32 else 1e-12)

@@ -19,13 +19,10 @@ def make_keypoints(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return points, functional.normalize(torch.randn(count, 128, generator=generator), dim=1)
 
 
-def as_pairs(found: tuple[torch.Tensor, torch.Tensor]) -> dict[tuple[int, ...], float]:
-    return dict(zip(map(tuple, found[0].tolist()), found[1].tolist(), strict=True))
-
-
 def test_exchanging_the_images_exchanges_the_matches(network: LightGlue) -> None:
     first, second = make_keypoints(30, 1), make_keypoints(40, 2)
-    there, back = (as_pairs(network(*pair, adaptive=False)) for pair in ((first, second), (second, first)))
+    found = (network(*pair, adaptive=False) for pair in ((first, second), (second, first)))
+    there, back = (dict(zip(map(tuple, pairs.tolist()), scores.tolist(), strict=True)) for pairs, scores in found)
     assert there and there.keys() == {(a, b) for b, a in back}
     assert all(back[b, a] == pytest.approx(score, rel=1e-3) for (a, b), score in there.items())
 

@@ -1,10 +1,7 @@
 """From panorama files to poses: the shipped sample, and input that cannot be used."""
 
 import itertools
-import json
 import math
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -15,14 +12,13 @@ import pytest
 import torch
 from refusals import expect_error
 
-import pansplat
 from pansplat.cli import run
+from pansplat.inputs.folders import load_sets
 from pansplat.poses import estimate as estimate_module
 from pansplat.poses.axes import SceneAxes
 from pansplat.poses.dense import Surroundings
 from pansplat.poses.depth import DepthMap
 from pansplat.poses.estimate import (
-    PoseEstimate,
     PoseGroup,
     _find_file,
     _is_mirrored,
@@ -32,7 +28,6 @@ from pansplat.poses.estimate import (
     estimate_poses,
 )
 from pansplat.poses.features import Features, Matches, detect_features
-from pansplat.poses.files import write_poses
 from pansplat.poses.learned import NO_LEARNED, LearnedFeatures
 from pansplat.poses.link_directions import NO_LINKS, LinkDirections
 from pansplat.poses.solvers import angle_between, rotation_angle
@@ -42,61 +37,26 @@ from pansplat.system.store import Store
 SAMPLE = Path(__file__).resolve().parents[2] / "assets" / "living_room"
 
 
-@pytest.fixture(scope="module")
-def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample's pictures at a small size, without poses."""
-    folder = tmp_path_factory.mktemp("photographs")
-    for name in ("left", "right"):
-        image = cv2.imread(str(SAMPLE / f"{name}.jpg"))
-        cv2.imwrite(str(folder / f"{name}.png"), cv2.resize(image, (1024, 512), interpolation=cv2.INTER_AREA))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def estimate(photographs: Path) -> PoseEstimate:
-    """The estimate of the sample; one picture is given twice."""
-    images = sorted(photographs.glob("*.png"))
-    return estimate_poses([*images, images[0]], camera_height=1.5)
+def _write_sample(folder: Path, *names: str, height: int = 512) -> list[Path]:
+    """Pictures of the sample at a small size."""
+    files = [folder / f"{name}.png" for name in names]
+    for file in files:
+        image = cv2.imread(str(SAMPLE / f"{file.stem}.jpg"))
+        cv2.imwrite(str(file), cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA))
+    return files
 
 
 @pytest.mark.slow
-def test_the_sample_has_its_poses(estimate: PoseEstimate) -> None:
-    content = json.loads((SAMPLE / "poses.json").read_text())["poses"]
-    truth = {}
-    for name in ("left", "right"):
-        entry = content[f"{name}.jpg"]
-        truth[name] = np.array(entry["cam2world"] if isinstance(entry, dict) else entry)
-    found = {path.stem: pose for path, pose in estimate.poses.items()}
-    motions = [np.linalg.inv(poses["right"]) @ poses["left"] for poses in (found, truth)]
+def test_the_sample_has_its_poses(tmp_path: Path) -> None:
+    """One picture is given twice."""
+    files = _write_sample(tmp_path, "left", "right")
+    found = estimate_poses([*files, files[0]], camera_height=1.5).poses
+    views = {view.name: view.cam2world.numpy() for view in load_sets(SAMPLE)[0].context}
+    pairs = [found[file] for file in files], [views[name] for name in ("left", "right")]
+    motions = [np.linalg.inv(right) @ left for left, right in pairs]
     assert math.degrees(rotation_angle(motions[0][:3, :3] @ motions[1][:3, :3].T)) < 0.05
     assert math.degrees(angle_between(motions[0][:3, 3], motions[1][:3, 3])) < 0.3
     assert np.linalg.norm(motions[0][:3, 3]) == pytest.approx(np.linalg.norm(motions[1][:3, 3]), rel=0.05)
-
-
-@pytest.mark.slow
-def test_written_poses_are_read_back(estimate: PoseEstimate, photographs: Path, tmp_path: Path) -> None:
-    shutil.copytree(photographs, tmp_path / "photographs")
-    write_poses(estimate, photographs / "poses.json")
-    (pair,) = pansplat.load_sets(photographs)
-    (photographs / "poses.json").unlink()
-    for panorama in pair.context:
-        assert np.allclose(panorama.cam2world.numpy(), estimate.poses[panorama.image], atol=1e-8)
-    (group,) = estimate.groups
-    assert (pair.near, pair.far) == pytest.approx((group.near, group.far), abs=1e-3)
-
-
-@pytest.mark.slow
-def test_a_folder_without_poses_is_loaded_with_estimated_ones(photographs, estimate, monkeypatch) -> None:
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", lambda images, **options: estimate)
-    message = "has no poses; they were estimated: 2 of 2 panoramas"
-    with pytest.warns(UserWarning, match=message):
-        (pair,) = pansplat.load_sets(photographs)
-    assert sorted(panorama.name for panorama in pair.context) == ["left", "right"]
-    assert not (photographs / "poses.json").exists()
-    monkeypatch.setattr("pansplat.poses.files.estimate_poses", None)  # the second call reads the cache
-    with pytest.warns(UserWarning, match=message):
-        (again,) = pansplat.load_sets(photographs)
-    assert all((a.cam2world == b.cam2world).all() for a, b in zip(pair.context, again.context, strict=True))
 
 
 def _message(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -119,14 +79,6 @@ def test_an_ordinary_picture_is_not_taken_for_a_panorama(tmp_path: Path, capsys:
     for n in range(2):
         cv2.imwrite(str(tmp_path / f"{n}.png"), (ramp[:, :: 1 - 2 * n] + shades).clip(0, 255).astype(np.uint8))
     assert _message(capsys, "pose", str(tmp_path)).count("its left and right edges do not join") == 2
-
-
-def test_a_name_that_is_not_utf8_is_refused_before_the_estimate(tmp_path: Path, capsys) -> None:
-    for name in (b"left.png", b"\xff.png"):
-        cv2.imwrite(str(tmp_path / "image.png"), np.full((64, 128, 3), 90, np.uint8))
-        (tmp_path / "image.png").rename(tmp_path / os.fsdecode(name))
-    for command in ("pose", "check"):
-        assert "needed a name in UTF-8, got other bytes; rename the file" in _message(capsys, command, str(tmp_path))
 
 
 def _relation(log_odds: float, problem: str | None = None) -> RelativePose:
@@ -239,12 +191,7 @@ def test_poses_of_pictures_outside_of_their_folder_are_refused_before_the_estima
 
 @pytest.mark.usefixtures("few_samples")
 def test_a_further_panorama_costs_its_own_features_and_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = []
-    for name in ("left", "middle", "right"):
-        image = cv2.imread(str(next(SAMPLE.glob(f"{name}.*"))))
-        files.append(tmp_path / f"{name}.png")
-        cv2.imwrite(str(files[-1]), cv2.resize(image, (512, 256), interpolation=cv2.INTER_AREA))
-    calls: list[str] = []
+    files, calls = _write_sample(tmp_path, "left", "middle", "right", height=256), []
     for name in ("find_axes", "_estimate_pair"):
         function = getattr(estimate_module, name)
         monkeypatch.setattr(

@@ -12,7 +12,6 @@ import torch
 from fake_card import CARD, pretend_card
 from numpy import ndarray as Array
 
-from pansplat.poses.features import Matches
 from pansplat.poses.learned import (
     LearnedFeatures,
     Matcher,
@@ -103,17 +102,12 @@ def test_a_matcher_on_a_card_finds_what_it_finds_on_the_processor(matcher, room,
         same = room[0].starts[face] + nearest.argmin(dim=1).numpy()
         np.testing.assert_allclose(features.bearings[own], room[0].bearings[same], atol=1e-5)
         assert nearest.min(dim=1).values.max() < 1e-3
-    _require_same_matches(matches, expected)
-
-
-def _require_same_matches(found: Matches, expected: Matches) -> None:
-    """The same pairs with the same prior, but for some at a limit, in any order."""
-    first, second = (
-        dict(zip(map(tuple, m.indices.tolist()), m.prior.tolist(), strict=True)) for m in (found, expected)
+    found, wanted = (
+        dict(zip(map(tuple, m.indices.tolist()), m.prior.tolist(), strict=True)) for m in (matches, expected)
     )
-    both = sorted(first.keys() & second.keys())
-    assert len(both) >= 0.99 * max(len(first), len(second))
-    np.testing.assert_allclose([first[pair] for pair in both], [second[pair] for pair in both], atol=1e-3)
+    both = sorted(found.keys() & wanted.keys())  # in any order, and some are at a limit
+    assert len(both) >= 0.99 * max(len(found), len(wanted))
+    np.testing.assert_allclose([found[pair] for pair in both], [wanted[pair] for pair in both], atol=1e-3)
 
 
 def test_masked_pixels_have_no_features(matcher: Matcher, render_room: Callable[..., Array]) -> None:

@@ -65,7 +65,7 @@ def test_directions_to_one_door_state_the_place_behind_its_wall(look_around, doo
     centres, rooms, unit = np.array(((0.5, 0, 0.3), (-1.0, 0, -0.4))), np.array((0, 5.2)), 1.35
     pieces, places, links = [], [], []
     for n, yaw in enumerate((0.4, -2.0)):
-        rotation = _upright(yaw) @ _tilt(tilt)
+        rotation = _upright(yaw) @ rotation_exp(np.array((tilt, 0.0, 0.5 * tilt)))
         surroundings = look_around(0, rotation, centres[n])
         axes = rotation @ surroundings.depth.rotation  # of the upright camera
         wall, ahead = axes.T @ (0, 0, 1), axes[:, 2]
@@ -88,7 +88,3 @@ def test_directions_to_one_door_state_the_place_behind_its_wall(look_around, doo
     pieces[1] = Piece(pieces[1].surroundings, None)
     assert best().distance(truth) < 0.05, "walls without edges are those of the surfaces"
     assert 0.5 < sum(guess.probability for guess in every) < 1
-
-
-def _tilt(angle: float) -> np.ndarray:
-    return rotation_exp(np.array((angle, 0.0, 0.5 * angle)))

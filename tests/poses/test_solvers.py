@@ -16,20 +16,18 @@ from pansplat.poses.solvers import (
 )
 
 
-def _nearest_essential(found, truth):
-    truth = truth / np.linalg.norm(truth)
-    found = found / np.linalg.norm(found, axis=(1, 2), keepdims=True)
-    return min(np.abs(found - truth).max(axis=(1, 2)).min(), np.abs(found + truth).max(axis=(1, 2)).min())
-
-
 @pytest.mark.parametrize("planar", [False, True])
 def test_five_exact_bearings_give_the_essential_matrix(scene, planar) -> None:
     for seed in range(5):
         bearings = scene(seed, 40, planar=planar)
         a, b = (x.reshape(8, 5, 3) for x in (bearings.first, bearings.second))
         found, sample = essential_from_five(a, b)
-        truth = skew(bearings.translation) @ bearings.rotation
-        errors = [_nearest_essential(found[sample == s], truth) for s in range(8) if (sample == s).any()]
+        truth, found = (
+            x / np.linalg.norm(x, axis=(-2, -1), keepdims=True)
+            for x in (skew(bearings.translation) @ bearings.rotation, found)
+        )
+        distances = np.minimum(*(np.abs(found - sign * truth).max(axis=(1, 2)) for sign in (1, -1)))
+        errors = [distances[sample == s].min() for s in range(8) if (sample == s).any()]
         assert np.median(errors) < 1e-6
         assert len(errors) >= 7
 
@@ -68,17 +66,6 @@ def test_points_are_in_front_of_both_cameras_for_the_right_pose_only(scene) -> N
         is_right = rotation_angle(r @ bearings.rotation.T) + angle_between(t, bearings.translation) < 1e-6
         in_front = (two_view_depths(bearings.first, bearings.second, r, t) > 0).all(axis=1).mean()
         assert in_front == 1 if is_right else in_front < 0.6
-
-
-def test_the_epipolar_angle_is_the_turn_that_bearings_need(scene) -> None:
-    bearings = scene(5)
-    assert np.abs(epipolar_angles(*vars(bearings).values())).max() < 1e-12
-    # A turn of the second bearing across its epipolar plane, shared by both bearings, shrinks by sqrt(2).
-    normal = np.cross(bearings.translation, bearings.first @ bearings.rotation.T)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    turned = bearings.second + 1e-5 * normal
-    angles = np.abs(epipolar_angles(bearings.first, turned, bearings.rotation, bearings.translation)) / 1e-5
-    assert (angles <= 1.0001).all() and (angles > 0.2).all()
 
 
 def test_rotation_matrices_have_the_angles_of_their_vectors() -> None:

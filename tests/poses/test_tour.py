@@ -13,6 +13,7 @@ from pansplat.poses.two_view import Hypotheses, RelativePose
 
 CENTRES = np.array(((0.0, 0, 0), (1.0, 0, 0.2), (1.4, 0, 1.5), (-0.8, 0, 1.1), (0.2, 0, 2.0)))  # camera heights
 ROTATIONS = rotation_exp(np.array(((0, 0, 0), (0, 0.5, 0), (0, -0.8, 0), (0, 2.0, 0), (0, -1.4, 0))))
+DOWN = np.stack([rotation.T @ (0.0, 1, 0) for rotation in ROTATIONS])
 COUNT = 60  # points of a pair
 
 
@@ -47,6 +48,18 @@ def list_kept(**changes) -> list[IndexPair]:
     return list(drop_contradictions(change_last(relations, **changes)))
 
 
+def see(world: np.ndarray, views: int = len(CENTRES), misleading: int = 0) -> list[Features]:
+    """What the first cameras see of points, and of the last ones with the third camera 20 % further from the second."""
+    features, wrong = [], slice(len(world) - misleading, None)
+    for view, (rotation, centre) in enumerate(zip(ROTATIONS[:views], CENTRES[:views], strict=True)):
+        rays = (world - centre) @ rotation
+        if view == 2:
+            rays[wrong] = (world[wrong] - CENTRES[1] - 1.2 * (centre - CENTRES[1])) @ rotation
+        rest = np.empty((len(world), 128), np.float32), np.zeros(len(world)), np.full(len(world), 1e-3)
+        features.append(Features(rays / np.linalg.norm(rays, axis=1, keepdims=True), *rest))
+    return features
+
+
 def build(*pairs: IndexPair, shared: bool = False, views: int = 3, misleading: int = 0, **changes) -> Tour:
     """The tour by the given pairs, each with own points unless all cameras share them.
 
@@ -57,21 +70,12 @@ def build(*pairs: IndexPair, shared: bool = False, views: int = 3, misleading: i
     rng = np.random.default_rng(0)
     world = rng.uniform(-4, 4, ((COUNT if shared else COUNT * len(pairs)) + misleading, 3))
     wrong = np.arange(len(world) - misleading, len(world))
-    features = []
-    for view, (rotation, centre) in enumerate(zip(ROTATIONS[:views], CENTRES[:views], strict=True)):
-        rays = (world - centre) @ rotation
-        if view == 2:
-            rays[wrong] = (world[wrong] - CENTRES[1] - 1.2 * (centre - CENTRES[1])) @ rotation
-        bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        rest = np.empty((len(world), 128), np.float32), np.zeros(len(world)), np.full(len(world), 1e-3)
-        features.append(Features(bearings, *rest))
     relations = {}
     for n, pair in enumerate(pairs):
         own = np.append(np.arange(COUNT) + (0 if shared else COUNT * n), wrong)
         relations[pair] = replace(relate(pair, np.stack((own, own), axis=1)), score=300.0 - n)
-    return build_tour(
-        features, change_last(relations, **changes), np.stack([r.T @ (0.0, 1, 0) for r in ROTATIONS[:views]]), 1e-3
-    )
+    relations = change_last(relations, **changes)
+    return build_tour(see(world, views, misleading), relations, DOWN[:views], 1e-3)
 
 
 def sides(group: Group) -> list[float]:
@@ -173,16 +177,9 @@ def suggest(pair: IndexPair, *log_odds: float, turn: float = 0.0, problem: str |
 
 def join(*suggested: tuple[IndexPair, RelativePose]) -> Tour:
     """The tour of two cameras with matches, and of others without."""
-    rng = np.random.default_rng(0)
-    world = rng.uniform(-4, 4, (COUNT, 3))
-    features = []
-    for rotation, centre in zip(ROTATIONS, CENTRES, strict=True):
-        rays = (world - centre) @ rotation
-        rest = np.empty((COUNT, 128), np.float32), np.zeros(COUNT), np.full(COUNT, 1e-3)
-        features.append(Features(rays / np.linalg.norm(rays, axis=1, keepdims=True), *rest))
-    own = np.arange(COUNT)
+    world, own = np.random.default_rng(0).uniform(-4, 4, (COUNT, 3)), np.arange(COUNT)
     relations = {(0, 1): relate((0, 1), np.stack((own, own), axis=1))} | dict(suggested)
-    return build_tour(features, relations, np.stack([r.T @ (0.0, 1, 0) for r in ROTATIONS]), 1e-3)
+    return build_tour(see(world), relations, DOWN, 1e-3)
 
 
 def is_right(group: Group) -> bool:

@@ -115,11 +115,6 @@ def no_idle_memory(monkeypatch):
     monkeypatch.setattr(kernels, "_returned", deque())
 
 
-def _used_address(shape, dtype):
-    """Address of an array of a workspace that has ended."""
-    return Workspace().array(shape, dtype).ctypes.data
-
-
 @pytest.mark.parametrize("shape", [(3, 16), (7,), 5, (0, 4), ()])
 def test_arrays_are_contiguous_and_aligned_to_a_cache_line(shape):
     workspace = Workspace()
@@ -161,4 +156,4 @@ def test_a_workspace_that_ends_while_the_lock_is_held_does_not_wait():
         del workspace
         gc.collect()
         assert kernels._idle == []
-    assert _used_address(5000, np.uint8) == address
+    assert Workspace().array(5000, np.uint8).ctypes.data == address

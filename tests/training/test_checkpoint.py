@@ -15,7 +15,6 @@ import pytest
 import torch
 from refusals import expect_error
 
-from pansplat.errors import InputError
 from pansplat.networks.weights import WeightsFile, save_weights
 from pansplat.training.checkpoint import list_checkpoints, load_checkpoint, load_latest, save_checkpoint
 from pansplat.training.trainer import Trainer
@@ -67,8 +66,7 @@ def test_a_full_disk_is_an_error_and_keeps_the_older_file(tmp_path: Path, full_d
 
 def test_a_checkpoint_with_code_is_an_error(tmp_path: Path) -> None:
     torch.save({"kind": "pansplat-training", "network": os.mkdir}, tmp_path / "step_00000001.pt")
-    with pytest.raises(InputError, match=r"calls .*mkdir"):
-        load_latest(tmp_path)
+    expect_error(r"calls .*mkdir", load_latest, tmp_path)
 
 
 _DAMAGE: dict[str, tuple[str, Callable[[dict[str, Any]], Any]]] = {
@@ -96,8 +94,7 @@ def test_a_damaged_checkpoint_names_its_key_and_the_previous_one(name: str, micr
     damage(content)
     torch.save(content, second)
     message = rf"{second.name}: this checkpoint is damaged.*{key}.*delete it to resume from .*{first.name}"
-    with pytest.raises(InputError, match=message):
-        Trainer(config, silent=True)
+    expect_error(message, Trainer, config, silent=True)
     second.unlink()
     assert Trainer(config, silent=True).resumed_from == first
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from panorama_fixtures import write_grey
+from panorama_formats import move
 from refusals import expect_error
 
 from pansplat.training.sequences import BoundedSampler, FramePair, read_loc360
@@ -37,17 +39,13 @@ def test_gaps_are_limited_by_the_length_of_the_sequence() -> None:
     expect_error("two or more posed frames, got 1", sampler.evaluation, 1)
 
 
-@pytest.fixture
-def write_loc360(write_panorama: Callable, matrix: Callable) -> Callable[..., None]:
-    def write(folder: Path, count: int = 9) -> None:
-        for i in range(count):
-            write_panorama(folder / "image" / f"{i}.png", i / 10)
-        (folder / "camera_pose.json").write_text(json.dumps({f"{i}.png": matrix(i) for i in range(count)}))
-
-    return write
+def write_loc360(folder: Path, count: int = 9) -> None:
+    for i in range(count):
+        write_grey(folder / "image" / f"{i}.png", i / 10)
+    (folder / "camera_pose.json").write_text(json.dumps({f"{i}.png": move(i) for i in range(count)}))
 
 
-def test_360loc_has_separate_locations_for_training_and_validation(tmp_path: Path, write_loc360: Callable) -> None:
+def test_360loc_has_separate_locations_for_training_and_validation(tmp_path: Path) -> None:
     for location in ("concourse", "hall", "piatrium"):
         write_loc360(tmp_path / location / "mapping" / "daytime_360_0")
     write_loc360(tmp_path / "hall" / "query_360" / "night_360_1", 5)

@@ -2,12 +2,13 @@
 
 import itertools
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from panorama_fixtures import write_depth_image, write_grey
+from panorama_formats import move, write_posed
 from refusals import expect_error
 
 from pansplat.inputs.folders import load_sets
@@ -16,20 +17,16 @@ from pansplat.training.config import DataConfig
 from pansplat.training.sources import PairSource, load_sources, read_game_maps, read_panogrf
 
 
-@pytest.fixture
-def write_triplets(write_panorama: Callable, write_depth: Callable, matrix: Callable) -> Callable[..., PairSource]:
-    def write(folder: Path, *names: str) -> PairSource:
-        for name in names:
-            for i in range(3):
-                write_panorama(folder / f"{name}_{i}.png", 0.2 * (i + 1))
-                write_depth(folder / f"{name}_{i}_depth.png", 1000 * (i + 1))
-            (folder / f"{name}.json").write_text(json.dumps({"c2w": [matrix(0), matrix(1), matrix(2)]}))
-        return read_game_maps(folder)
-
-    return write
+def write_triplets(folder: Path, *names: str) -> PairSource:
+    for name in names:
+        for i in range(3):
+            write_grey(folder / f"{name}_{i}.png", 0.2 * (i + 1))
+            write_depth_image(folder / f"{name}_{i}_depth.png", 1000 * (i + 1))
+        (folder / f"{name}.json").write_text(json.dumps({"c2w": [move(0), move(1), move(2)]}))
+    return read_game_maps(folder)
 
 
-def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_triplets: Callable) -> None:
+def test_game_map_triplets_are_samples_with_depth(tmp_path: Path) -> None:
     source = write_triplets(tmp_path, "a", "b")
     samples = [source.sample(index, 8, 0) for index in range(len(source))]
     assert [sample.name for sample in samples] == ["a", "b"]
@@ -45,16 +42,16 @@ def test_game_map_triplets_are_samples_with_depth(tmp_path: Path, write_triplets
     assert torch.equal(moved.images, batch.images) and moved.names == batch.names
 
 
-def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path, write_triplets: Callable) -> None:
+def test_samples_of_different_shapes_cannot_be_batched(tmp_path: Path) -> None:
     source = write_triplets(tmp_path, "a")
     expect_error(r"\(2, 3, 8, 16\)", lambda: collate([source.sample(0, 8, 0), source.sample(0, 4, 0)]))
     expect_error("at least one sample", collate, [])
 
 
-def test_panogrf_scenes_are_read_by_stage_and_height(tmp_path: Path, write_panorama: Callable) -> None:
+def test_panogrf_scenes_are_read_by_stage_and_height(tmp_path: Path) -> None:
     for scene, i in itertools.product(range(2), range(3)):
         view = tmp_path / "png_render_val_1024x512_seq_len_3_m3d_dist_0.5" / f"{scene:08d}" / f"{i:02d}"
-        write_panorama(view / "rgb.png", 0.2 * (i + 1))
+        write_grey(view / "rgb.png", 0.2 * (i + 1))
         np.savetxt(view / "rot.txt", np.eye(3))
         np.savetxt(view / "tran.txt", [0, 0, 0.5 * i])
     sample = read_panogrf(tmp_path, "val", 256).sample(1, 8, 0)
@@ -63,12 +60,8 @@ def test_panogrf_scenes_are_read_by_stage_and_height(tmp_path: Path, write_panor
     expect_error(r"4096x2048_seq_len_3_m3d_dist_0\.5", read_panogrf, tmp_path, "val", 2048)
 
 
-def test_pairs_need_targets_and_a_random_one_is_chosen(tmp_path, write_panorama, matrix) -> None:
-    names = [f"{i}.png" for i in range(5)]
-    for i, name in enumerate(names):
-        write_panorama(tmp_path / name, i / 10)
-    poses = {name: matrix(i) for i, name in enumerate(names)}
-    (tmp_path / "poses.json").write_text(json.dumps({"convention": "cam2world opencv", "poses": poses}))
+def test_pairs_need_targets_and_a_random_one_is_chosen(tmp_path: Path) -> None:
+    write_posed(tmp_path, {f"{i}.png": np.full((8, 16, 3), 25 * i, np.uint8) for i in range(5)}, range(5))
     groups = {"pairs": [{"context": ["0.png", "4.png"], "target": ["1.png", "2.png", "3.png"]}]}
     (tmp_path / "pairs.json").write_text(json.dumps(groups))
     pairs = load_sets(tmp_path)

@@ -304,19 +304,15 @@ def test_the_state_after_clicks_and_keys_of_imgui(user):
     assert not failed
 
 
-def predict_forever(entry, show):
-    while True:
-        report_progress("estimating poses", 0.3)
-        time.sleep(0.002)
-
-
 def test_a_prediction_a_refinement_and_an_error_have_their_buttons(user, small_scene):
     session, before = user.viewer.session, user.read_image()
 
     def load(entry, show):
         if entry.name == "kitchen":
             show(LoadedScene(entry, small_scene, is_final=False))
-        predict_forever(entry, show)
+        while True:
+            report_progress("estimating poses", 0.3)
+            time.sleep(0.002)
 
     user.load = load
     user.click("Reload")

@@ -537,12 +537,6 @@ def test_a_path_replaces_its_own_file_only(app, tmp_path):
     assert own.read_text() == "{}"
 
 
-def click_on(app: App, node: int) -> None:
-    """Click on the hotspot of a panorama."""
-    (spot,) = [spot for spot in app.viewer.hotspots if spot.node == node]
-    app.frame(click=(spot.center[0] / SIZE[0], spot.center[1] / SIZE[1]))
-
-
 @pytest.mark.parametrize("found", [{"poor": [(1, 2)]}, {"walls": [(1, 2)]}])
 def test_a_refined_part_stays_in_the_tour_whose_edges_the_prediction_changed(make_app, house, load_house, found):
     app, go = make_app(), threading.Event()
@@ -723,7 +717,7 @@ def test_a_link_leads_to_a_panorama_without_a_place_and_the_scene_before_stays(m
     (spot,) = [spot for spot in app.viewer.hotspots if not spot.is_arrow]
     assert (spot.node, spot.label, spot.is_zoom) == (3, "to the hall", True)
     left, stage = app.viewer.stage.slot.scene, app.viewer.stage
-    click_on(app, 3)
+    app.frame(click=(spot.center[0] / SIZE[0], spot.center[1] / SIZE[1]))
     app.until(lambda: app.session.tour.part == 1, "fade", 0.2)
     poses, front = stage.fade.poses, stage.fade.front
     assert np.linalg.norm(poses[1 - front][:3, 3] - parted_house.positions[2]) < 1e-6, "the scene before stays"

@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 import shapely
 import torch
+from refusals import expect_error
 
 from pansplat import pipeline
 from pansplat.bench.scenes import full_lattice_room, make_room_cameras
-from pansplat.errors import InputError, InputWarning
+from pansplat.errors import InputWarning
 from pansplat.export import page as page_module
 from pansplat.export import page_files, page_scene
 from pansplat.export.page import choose_gaussians, write_page
@@ -58,6 +59,10 @@ def read_header(path: Path) -> dict[str, Any]:
     return json.loads(header)
 
 
+def describe(scene: Scene, path: Path, **options: Any) -> dict[str, Any]:
+    return read_header(write_page(scene, path, **options).files[0])
+
+
 def read_start(path: Path) -> list[float]:
     """Yaw and pitch of the first view of a page."""
     header = read_header(path)
@@ -84,8 +89,7 @@ def test_the_page_describes_the_scene(scene: Scene, tmp_path: Path) -> None:
 def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) -> None:
     cameras = make_room_cameras(2)
     room = Scene(full_lattice_room(128), cameras, 0.1, 10.0, names=("west", "east"), height=128)
-    write_page(room, tmp_path / "room.html")
-    header = read_header(tmp_path / "room.html")
+    header = describe(room, tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     found, (expected,) = header["plan"], TourFacts(room).plan.rooms
     svg, size, marks = draw_page_plan(TourFacts(room).plan)
@@ -145,8 +149,7 @@ def test_panoramas_on_both_sides_of_a_wall_have_links(flat: Scene, tmp_path: Pat
     """The nearest ones of two parts without a link; others have that of their tour."""
     walls = tuple((node, alone, 0.0) for alone in (2, 3) for node in (0, 1))
     tour = SceneTour((*flat.tour.overlaps, *walls), flat.tour.links)
-    write_page(dataclasses.replace(flat, tour=tour), tmp_path / "page.html")
-    header = read_header(tmp_path / "page.html")
+    header = describe(dataclasses.replace(flat, tour=tour), tmp_path / "page.html")
     spots, level = header["spots"], np.array(header["level"])
     places = np.array([spot["position"] for spot in spots])
     near = int(np.linalg.norm(places[:2] - places[3], axis=1).argmin())
@@ -172,8 +175,7 @@ def test_a_page_zooms_along_poor_edges(house: Scene, tmp_path: Path, monkeypatch
 
 
 def test_the_page_of_a_tour_has_its_edges_and_its_walk(house: Scene, tmp_path: Path) -> None:
-    write_page(dataclasses.replace(house, names=("hall", "hall", "bath")), tmp_path / "tour.html")
-    header = read_header(tmp_path / "tour.html")
+    header = describe(dataclasses.replace(house, names=("hall", "hall", "bath")), tmp_path / "tour.html")
     assert [spot["name"] for spot in header["spots"]] == ["hall", "hall", "bath"], "rooms of poses.json"
     assert header["groups"] == [[0, 1], [1, 2]] and header["edges"] == [[0, 1, 0], [1, 2, 1]]
     assert header["next"] == [[0, 1, 1], [0, 1, 2], [1, 1, 2]]
@@ -181,8 +183,7 @@ def test_the_page_of_a_tour_has_its_edges_and_its_walk(house: Scene, tmp_path: P
 
 
 def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> None:
-    write_page(flat, tmp_path / "tour.html")
-    header = read_header(tmp_path / "tour.html")
+    header = describe(flat, tmp_path / "tour.html")
     assert header["parts"] == [0, 0, 1, 2] and header["edges"] == [[0, 1, 0], [2, 2, 1], [3, 3, 2]]
     assert header["groups"] == [[0, 1], [2], [3]]
     spots, level = header["spots"], np.array(header["level"])
@@ -205,8 +206,7 @@ def test_the_page_of_a_tour_of_parts_has_links(flat: Scene, tmp_path: Path) -> N
 
 def test_a_page_with_photographs_has_gaussians_only_where_a_camera_flies(flat, tmp_path, take_photographs) -> None:
     photographs = take_photographs(flat, 64)
-    write_page(flat, tmp_path / "tour.html", photographs=photographs)
-    header = read_header(tmp_path / "tour.html")
+    header = describe(flat, tmp_path / "tour.html", photographs=photographs)
     assert [view["count"] > 0 for view in header["views"]] == [True, True, False, False]
     assert header["limits"] == [pytest.approx(2.0), 0, 0] and header["loading"] == [0, 1, 2, 3]
     alone = dataclasses.replace(flat, tour=SceneTour(tuple((node, node, 1.0) for node in range(4)), flat.tour.links))
@@ -219,8 +219,7 @@ def test_the_camera_stays_within_a_metre_of_a_single_photograph(scene, tmp_path,
     single = select_views(scene, (1,))  # its surfaces are 2 to 3 m away
     center = single.cam2world[0, :3, 3].float()
     gaussians = dataclasses.replace(single.gaussians, means=center + size * (single.gaussians.means - center))
-    write_page(dataclasses.replace(single, gaussians=gaussians, starts=((0.4, 0.1),)), tmp_path / "page.html")
-    header = read_header(tmp_path / "page.html")
+    header = describe(dataclasses.replace(single, gaussians=gaussians, starts=((0.4, 0.1),)), tmp_path / "page.html")
     assert header["limits"] == pytest.approx([limit], abs=0.01)
     assert header["spots"][0]["ahead"] == pytest.approx([0.4, -0.1], abs=1e-4)
 
@@ -407,8 +406,7 @@ def test_a_split_page_finds_its_parts_under_any_name(scene: Scene, tmp_path: Pat
 
 
 def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussians(scene, take_photographs, tmp_path):
-    write_page(scene, tmp_path / "tour.html", photographs=take_photographs(scene, 1024))
-    header = read_header(tmp_path / "tour.html")
+    header = describe(scene, tmp_path / "tour.html", photographs=take_photographs(scene, 1024))
     first, *others = header["loading"]
     names = [photograph["name"] for photograph in header["photographs"]]
     calls = re.findall(r"<script>(add\w+\([^<]*\))</script>", (tmp_path / "tour.html").read_text())
@@ -419,8 +417,7 @@ def test_the_smallest_photograph_of_the_first_panorama_comes_before_all_gaussian
 
 def test_a_scene_without_cameras_starts_in_its_middle(scene: Scene, tmp_path: Path) -> None:
     bare = dataclasses.replace(scene, cam2world=torch.zeros(0, 4, 4, dtype=torch.float64), names=())
-    write_page(bare, tmp_path / "tour.html", gaussians=1000)
-    header = read_header(tmp_path / "tour.html")
+    header = describe(bare, tmp_path / "tour.html", gaussians=1000)
     assert len(header["views"]) == 1 and header["views"][0]["count"] == header["count"] <= 1000
     assert header["spots"][0]["name"] == "start" and np.allclose(header["spots"][0]["position"], 0)
 
@@ -435,7 +432,7 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(scene: Scene, tmp_path: Pat
 
 def test_large_pages_have_a_lower_degree_of_harmonics(scene, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(page_module, "_TARGET_BYTES", 32 * len(scene.gaussians))
-    assert read_header(write_page(scene, tmp_path / "tour.html").files[0])["degree"] == 0
+    assert describe(scene, tmp_path / "tour.html")["degree"] == 0
 
 
 def test_a_page_of_another_unit_is_that_of_metres_but_for_the_lengths_it_shows(flat: Scene, tmp_path: Path) -> None:
@@ -457,23 +454,20 @@ def test_pages_that_cannot_be_drawn_or_written_are_refused(scene, tmp_path, monk
         (scene, "tour.html", {"gaussians": 4_000_001}, "must be 1 to 4,000,000"),
         (scene, "missing/tour.html", {"split": True}, "missing/tour_files: needed a folder"),
     ):
-        with pytest.raises(InputError, match=message):
-            write_page(given, tmp_path / name, **options)
+        expect_error(message, write_page, given, tmp_path / name, **options)
     assert not list(tmp_path.iterdir())
     (tmp_path / "tour_files").write_text("")
-    with pytest.raises(InputError, match="tour_files: needed a folder"):
-        write_page(scene, tmp_path / "tour.html", split=True)
+    expect_error("tour_files: needed a folder", write_page, scene, tmp_path / "tour.html", split=True)
     monkeypatch.undo()
     monkeypatch.setattr(page_module, "_POSTER_SIZE", (27, 32))
-    with pytest.raises(InputError, match="existing folder"):
-        write_page(scene, tmp_path / "missing" / "tour.html")
+    expect_error("existing folder", write_page, scene, tmp_path / "missing" / "tour.html")
     assert [file.name for file in tmp_path.iterdir()] == ["tour_files"]
 
 
 def test_the_page_of_a_fused_tour_draws_all_gaussians_everywhere(house: Scene, tmp_path: Path) -> None:
     fused = dataclasses.replace(house, joint=True)
     with pytest.warns(InputWarning, match="Export the folder of the photographs"):
-        header = read_header(write_page(fused, tmp_path / "house.html").files[0])
+        header = describe(fused, tmp_path / "house.html")
     assert header["edges"] == [[0, 1, 0], [0, 2, 0], [1, 2, 0]] and header["groups"] == [[0, 1, 2]]
     assert header["count"] == len(house.gaussians)
     with warnings.catch_warnings():

@@ -29,8 +29,8 @@ def server(plain_scene: Scene, tmp_path: Path) -> Iterator[PageServer]:
         server.shutdown()
 
 
-def ask(server: PageServer, path: str, method: str = "GET") -> tuple[http.client.HTTPResponse, bytes]:
-    """The answer and its content; the certificate must be valid for the address."""
+def ask(server: PageServer, path: str, method: str = "GET") -> tuple[int, http.client.HTTPMessage, bytes]:
+    """Status, headers and content; the certificate must be valid for the address."""
     port = server.server_address[1]
     context = ssl.create_default_context(cadata=ssl.get_server_certificate(("127.0.0.1", port)))
     connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=30)
@@ -38,22 +38,17 @@ def ask(server: PageServer, path: str, method: str = "GET") -> tuple[http.client
     answer = connection.getresponse()
     content = answer.read()
     connection.close()
-    return answer, content
-
-
-def get(server: PageServer, path: str, method: str = "GET") -> tuple[int, str | None, bytes]:
-    """Status, type and content."""
-    answer, content = ask(server, path, method)
-    return answer.status, answer.getheader("Content-Type"), content
+    return answer.status, answer.headers, content
 
 
 def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, tmp_path: Path) -> None:
     page = (tmp_path / "our home.html").read_bytes()
     for path in ("/", "/our%20home.html", "/?from=qr"):
-        assert get(server, path) == (200, "text/html; charset=utf-8", page)
+        status, headers, content = ask(server, path)
+        assert (status, headers["Content-Type"], content) == (200, "text/html; charset=utf-8", page)
     part, *_ = (tmp_path / "our home_files").iterdir()
-    status, kind, content = get(server, f"/our%20home_files/{part.name}")
-    assert (status, kind, content) == (200, "application/octet-stream", part.read_bytes())
+    status, headers, content = ask(server, f"/our%20home_files/{part.name}")
+    assert (status, headers["Content-Type"], content) == (200, "application/octet-stream", part.read_bytes())
     assert b'"our%20home_files"' in page and f'"{part.name}"'.encode() in page
     wrong = (
         "secret.html",
@@ -64,19 +59,19 @@ def test_the_page_and_its_parts_are_served_and_nothing_else(server: PageServer, 
         "[::1",
     )
     for path in map("/{}".format, wrong):
-        status, _, content = get(server, path)
+        status, _, content = ask(server, path)
         assert status == 404 and b"not for others" not in content
-    assert get(server, "/", "HEAD")[::2] == (200, b"")
-    assert get(server, "/", "POST")[0] == 501
+    assert ask(server, "/", "HEAD")[::2] == (200, b"")
+    assert ask(server, "/", "POST")[0] == 501
     part.unlink()
-    assert get(server, f"/our%20home_files/{part.name}")[0] == 404
+    assert ask(server, f"/our%20home_files/{part.name}")[0] == 404
 
 
 def test_every_answer_forbids_frames_and_guesses_of_types(server: PageServer) -> None:
     for path, method, status in (("/", "GET", 200), ("/", "HEAD", 200), ("/none", "GET", 404), ("/", "POST", 501)):
-        answer, _ = ask(server, path, method)
-        assert answer.status == status and answer.getheader("X-Content-Type-Options") == "nosniff"
-        assert answer.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
+        found, headers, _ = ask(server, path, method)
+        assert found == status and headers["X-Content-Type-Options"] == "nosniff"
+        assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
 
 
 def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(server, capfd) -> None:
@@ -84,7 +79,7 @@ def test_a_client_that_sends_nothing_or_plain_http_does_not_stop_others(server, 
     with socket.create_connection(("127.0.0.1", port)), socket.create_connection(("127.0.0.1", port)) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert not plain.recv(1000).startswith(b"HTTP")
-        assert get(server, "/")[0] == 200
+        assert ask(server, "/")[0] == 200
     assert capfd.readouterr() == ("", "")
 
 

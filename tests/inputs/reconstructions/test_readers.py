@@ -319,6 +319,7 @@ def test_a_file_that_cannot_be_used_is_named_with_what_to_do(tmp_path, cameras, 
         ({"frames": [frame | {"k1": 0.1}]}, "frame 0: .*k1"),
         ({"frames": [frame | {"camera_model": "OPENCV_FISHEYE"}]}, "OPENCV_FISHEYE"),
         ({"frames": [frame | {"file_path": "gone.png"}]}, r"gone\.png"),
+        ({"frames": [frame | {"mask_path": "masks/a.png"}]}, r"frame 0: .*masks/a\.png"),
         ({"frames": [frame | {"transform_matrix": [[1]]}]}, "4x4"),
         ({"frames": [{key: frame[key] for key in ("file_path", "transform_matrix")}]}, '"fl_x"'),
     ):

@@ -48,7 +48,8 @@ def test_pycolmap_reads_cameras_rigs_and_points(dataset: Path, cameras: list[Arr
     assert model.is_valid()
     for number, pose in enumerate(cameras):
         image = model.find_image_with_name(f"{number:04d}_p_{number}_front.png")
-        np.testing.assert_allclose(np.linalg.inv(_matrix(image)), pose, atol=1e-9)
+        world = np.vstack((image.cam_from_world().matrix(), (0, 0, 0, 1)))
+        np.testing.assert_allclose(np.linalg.inv(world), pose, atol=1e-9)
         assert (dataset / "images" / image.name).is_file()
     assert np.allclose(sorted(p.xyz[0] for p in model.points3D.values()), sorted(points[:, 0]), atol=1e-4)
     # A rig composes to the poses that images.txt states.
@@ -58,12 +59,6 @@ def test_pycolmap_reads_cameras_rigs_and_points(dataset: Path, cameras: list[Arr
         rows = [line.split() for line in (dataset / "sparse/0/images.txt").read_text().splitlines()]
         stated = next(np.array(row[5:8], float) for row in rows if row and row[-1] == image.name)
         np.testing.assert_allclose(image.cam_from_world().translation, stated, atol=1e-9)
-
-
-def _matrix(image) -> Array:
-    matrix = np.eye(4)
-    matrix[:3] = image.cam_from_world().matrix()
-    return matrix
 
 
 def test_both_files_project_a_point_to_the_same_pixel(dataset: Path, points: Array) -> None:

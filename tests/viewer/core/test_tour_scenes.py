@@ -299,13 +299,6 @@ def test_the_film_of_a_tour_has_neither_black_nor_jumps(house, open_tour_film, t
     assert change > 30 and steps.max() < 0.3 * change, "scenes of different colours fade"
 
 
-def test_a_film_zooms_along_a_poor_edge(house, open_tour_film):
-    facts = TourFacts(open_tour_film(house)[1])
-    vars(facts)["poor"] = ((0, 1),)
-    kinds = [step.kind for step in plan_visits(facts).steps if set(step.nodes) == {0, 1}]
-    assert "zoom" in kinds and "flight" not in kinds
-
-
 @pytest.mark.gl
 def test_the_command_writes_the_film_of_a_folder_of_panoramas(house, load_house, monkeypatch, tmp_path, capsys):
     rows = {p.image.name: p.cam2world.tolist() for p in house.panoramas}

@@ -16,11 +16,6 @@ CACHED = DrawSettings(cached=True, background=(0.3, 0.2, 0.1))
 STORAGES = (CACHED, replace(CACHED, cached=False))
 
 
-def enlarge_gaussians(scene):
-    """The scene with Gaussians of several pixels, which resampling hardly blurs."""
-    return replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
-
-
 def render_image(renderer, pose, settings, size=SIZE):
     renderer.render(pose, size, settings)
     return renderer.read_color()
@@ -38,7 +33,8 @@ def drawn(monkeypatch) -> list[int]:
 
 @pytest.mark.parametrize(("mode", "color_bits"), [("joint", 16), ("deferred", 32)])
 def test_cached_faces_give_image_and_depth_of_direct_drawing(make_renderer, random_scene, pose, turn, mode, color_bits):
-    scene = enlarge_gaussians(random_scene(400, size=0.2))
+    scene = random_scene(400, size=0.2)  # of several pixels, which resampling hardly blurs
+    scene = replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
     kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)
     for degrees in (0, 40, 100, 170, 260):
         camera, settings = turn(pose, degrees), replace(CACHED, mode=mode)
