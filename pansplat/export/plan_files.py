@@ -30,7 +30,8 @@ from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import list_storeys_of_worlds
 from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.linked_rooms import turn_plan
-from pansplat.tours.plan import Plan, Room
+from pansplat.tours.plan import Plan
+from pansplat.tours.rooms import Room
 
 _PAPER = 0.02  # metres of paper for a metre of the plan: 1:50
 _INCH = 0.0254  # metres
