@@ -1,10 +1,21 @@
-// Draws the doll's house: triangles with the element `atlas` as texture, of which only fronts are seen.
+// Shows the doll's house: triangles with the element `atlas` as texture, of which only fronts are seen.
 
 import { findHouse } from "./doll.js";
 import { byId } from "./dom.js";
-import { state } from "./state.js";
+import { camera, changed, state } from "./state.js";
 
 const houses = new WeakMap(); // what each renderer needs
+
+export const canShowDoll = () => state.sorted !== null && byId("atlas")?.complete === true;
+
+// Opens or closes the doll's house without a flight. `isDue`: it opens when its data is there.
+export function setDoll(isOn, isDue = false) {
+  const { doll } = state;
+  if (doll.isOn && !isOn) camera.fov = doll.fov;
+  Object.assign(doll, { isOn, isDue, flight: null });
+  byId("doll").setAttribute("aria-pressed", isOn || isDue);
+  changed();
+}
 
 function makeHouse(renderer) {
   const { gl } = renderer, triangles = gl.createVertexArray(), atlas = gl.createTexture();
