@@ -32,7 +32,7 @@ function makeHouse(renderer) {
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LOD, 3); // the margins of the textures are as wide
   const sharper = gl.getExtension("EXT_texture_filter_anisotropic");
   if (sharper) gl.texParameteri(gl.TEXTURE_2D, sharper.TEXTURE_MAX_ANISOTROPY_EXT, 8);
-  return { triangles, atlas, ...renderer.link(SHADERS.house) };
+  return { triangles, atlas, ...renderer.link(SHADERS.house, "atlas") };
 }
 
 // Draws to the canvas, which has a depth and several samples a pixel.
@@ -53,7 +53,6 @@ export function drawHouse({ position, rotation, center, half }, width, height) {
   gl.uniformMatrix3fv(places.level, true, HEADER.level.flat());
   gl.uniform3fv(places.position, position);
   gl.uniform4f(places.window, ...center, ...half);
-  gl.uniform1i(places.atlas, 0);
   renderer.bind([atlas]);
   gl.bindVertexArray(triangles);
   const first = HEADER.doll.slice(0, HEADER.doll.indexOf(house)).reduce((sum, { corners }) => sum + corners.length, 0);

@@ -51,7 +51,6 @@ function goToPose(pose) {
 }
 
 export const setPose = (pose) => goToPose(cameraFor(pose));
-
 export const goHome = () => goToPose(makeStart());
 
 // Goes to a panorama without a flight.

@@ -343,7 +343,7 @@ class Headset {
     const { gl } = this;
     if (this.renderer !== state.renderer) {
       this.renderer = state.renderer;
-      this.program = state.renderer.link(SHADERS.mark);
+      this.program = state.renderer.link(SHADERS.mark, "picture");
       this.picture = gl.createTexture();
       this.hovered = null;
     }
@@ -352,9 +352,7 @@ class Headset {
     gl.uniformMatrix3fv(places.world_to_camera, false, eye.rotation.flat());
     gl.uniform3fv(places.position, eye.position);
     gl.uniform4f(places.window, ...eye.center, ...eye.half);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
-    gl.uniform1i(places.picture, 0);
+    state.renderer.bind([this.picture]);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(state.renderer.screen);
