@@ -1,6 +1,6 @@
 // Draws the Gaussians of HEADER's views with WebGL 2 (docs/rendering.md), as they arrive.
 
-import { inAxes, scaled, unit } from "./graph.js";
+import { inAxes, unit } from "./graph.js";
 
 const TEXTURE_WIDTH = 2048; // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
@@ -189,7 +189,7 @@ export class Renderer {
     // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
     gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
     gl.uniform3fv(places.position, position);
-    gl.uniform3fv(places.shift, scaled(inAxes(rotation, shift), 1 / Math.sqrt(12)));
+    gl.uniform3fv(places.shift, inAxes(rotation, shift));
     gl.uniform1f(places.near, HEADER.near);
     gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
     gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);
