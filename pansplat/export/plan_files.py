@@ -201,7 +201,8 @@ class _Drawing:
 
     def _turn(self, places: Float[np.ndarray, "*n 2"], node: int) -> Float[np.ndarray, "*n 2"]:
         """Places around a panorama in its turned world."""
-        return self.plan.draw(node, places) @ self._turns[self._pieces[node][0]]
+        moved = self.plan.drawn[node].move(places) if node in self.plan.drawn else places
+        return moved @ self._turns[self._pieces[node][0]]
 
     @cached_property
     def _layout(self) -> tuple[dict[tuple[int, int], Float[np.ndarray, "2"]], tuple[float, float]]:

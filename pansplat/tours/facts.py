@@ -15,12 +15,11 @@ from jaxtyping import Float
 from pansplat.gaussians.scene import Scene
 from pansplat.system.source_hash import hash_sources
 from pansplat.system.store import Store, hash_parts
-from pansplat.tours.doors import Door
 from pansplat.tours.edges import find_poor_edges, find_walls
 from pansplat.tours.floor import FloorOutline, choose_camera_height, find_ceiling, find_floor, find_floor_outline
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
 from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
-from pansplat.tours.plan import Plan, make_plan
+from pansplat.tours.plan import Door, Plan, make_plan
 from pansplat.tours.rooms import Room
 from pansplat.tours.scene_graph import describe_tour, make_graph
 from pansplat.tours.surfaces import Surfaces, find_surfaces
@@ -117,7 +116,7 @@ class TourFacts:
 
     @_stored
     def _floors(self) -> list[FloorOutline | None]:
-        return [find_floor_outline(own) for own in self.surfaces.values()]
+        return [find_floor_outline(own.samples, own.center[[0, 2]]) for own in self.surfaces.values()]
 
     @cached_property
     def outlines(self) -> dict[int, FloorOutline]:

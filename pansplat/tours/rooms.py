@@ -77,22 +77,20 @@ def find_rooms(
         in_world = [sight for node, sight in sights.items() if tour.worlds[node] == world]
         normals = find_directions(in_world, unit) if in_world else np.eye(2)
         members = {node: sight for node, sight in sights.items() if pieces[node] == piece}
-        found = [(*room, True) for room in _outline_rooms(members, normals, unit)]
+        found = [([*nodes], shape, True) for nodes, shape in _outline_rooms(members, normals, unit)]
         free = {node for node, other in enumerate(pieces) if other == piece}.difference(*(nodes for nodes, *_ in found))
         for view in sorted(free):  # those in a room come last in it
             point = shapely.Point(surfaces[view].center[[0, 2]])
-            shapes = [Polygon(outline) for _, outline, _ in found]
-            inside = [number for number, shape in enumerate(shapes) if shape.contains(point)]
-            if inside:
-                nodes, *others = found[inside[0]]
-                found[inside[0]] = ((*nodes, view), *others)
-            elif (
-                outline := _enclose(surfaces[view], floors[view], normals, shapely.union_all(shapes), unit)
-            ) is not None:
-                found.append(((view,), outline, False))
-        for nodes, outline, is_closed in found:
+            inside = next((nodes for nodes, shape, _ in found if shape.contains(point)), None)
+            beside = shapely.union_all([shape for _, shape, _ in found])
+            if inside is not None:
+                inside.append(view)
+            elif (shape := _enclose(surfaces[view], floors[view], normals, beside, unit)) is not None:
+                found.append(([view], shape, False))
+        for nodes, shape, is_closed in found:
             is_placed = not tour.overlaps or tour.is_placed(nodes[0]) or len(tour) == 1
-            rooms.append(Room(_name_room(tour, nodes), nodes, outline, storey, is_placed, is_closed))
+            corners = np.array(shapely.orient_polygons(shape).exterior.coords)[:-1]
+            rooms.append(Room(_name_room(tour, nodes), tuple(nodes), corners, storey, is_placed, is_closed))
     return rooms
 
 
@@ -103,7 +101,7 @@ def _name_room(tour: TourGraph, nodes: Sequence[int]) -> str:
 
 def _outline_rooms(
     sights: Mapping[int, Sight], normals: Float[np.ndarray, "direction 2"], unit: float
-) -> list[tuple[tuple[int, ...], Outline]]:
+) -> list[tuple[tuple[int, ...], Polygon]]:
     """The rooms of a storey: the panoramas whose own walls are closed, and outlines."""
     alone = {node: trace_outline(sight, find_lines([sight], normals, unit), unit) for node, sight in sights.items()}
     traced = [node for node, own in alone.items() if own is not None and own.area > _LEAST_AREA * unit**2]
@@ -124,7 +122,7 @@ def _outline_rooms(
         for piece in shapely.get_parts(_clean(shape, unit))
         if piece.area > _LEAST_AREA * unit**2
     ]
-    return [(nodes, _list_corners(shapely.normalize(piece))) for nodes, piece in pieces if nodes]
+    return [(nodes, shapely.normalize(piece)) for nodes, piece in pieces if nodes]
 
 
 def _separate(
@@ -135,10 +133,8 @@ def _separate(
     result = [shape for _, shape in shapes]
     centers = [shapely.MultiPoint([sights[node].center for node in nodes]) for nodes, _ in shapes]
     for a, b in itertools.combinations(range(len(shapes)), 2):
-        common = result[a].intersection(result[b])
-        for piece in shapely.get_parts(common):
-            if piece.area == 0:
-                continue
+        common = shapely.get_parts(result[a].intersection(result[b]))
+        for piece in common[shapely.area(common) > 0]:
             place = piece.representative_point()
             rank = {k: (len(_list_inside(shapes[k][0], sights, piece)), -centers[k].distance(place)) for k in (a, b)}
             loser = min(b, a, key=lambda k: rank[k])
@@ -157,7 +153,7 @@ def _clean(shape: shapely.Geometry, unit: float) -> shapely.Geometry:
 
 def _enclose(
     surfaces: Surfaces, floor: FloorOutline | None, normals: np.ndarray, beside: shapely.Geometry, unit: float
-) -> Outline | None:
+) -> Polygon | None:
     """A rectangle along the walls around a camera without closed walls: the extent of its floor, or of the surfaces at
     its height, without the rooms beside it; None if nothing of it is left.
     """
@@ -170,13 +166,7 @@ def _enclose(
     box = Polygon(shapely.get_coordinates(shapely.box(*low, *high)) @ axes.T)
     free = _clean(box.difference(beside).buffer(0), unit)
     pieces = [piece for piece in shapely.get_parts(free) if piece.area > _LEAST_PIECE * unit**2]
-    piece = min(pieces, key=lambda piece: piece.distance(shapely.Point(center)), default=None)
-    return None if piece is None else _list_corners(piece)
-
-
-def _list_corners(shape: Polygon) -> Outline:
-    """The corners of a shape, anticlockwise."""
-    return np.array(shapely.orient_polygons(shape).exterior.coords)[:-1]
+    return min(pieces, key=lambda piece: piece.distance(shapely.Point(center)), default=None)
 
 
 def _list_inside(nodes: Iterable[int], sights: Mapping[int, Sight], shape: shapely.Geometry) -> tuple[int, ...]:

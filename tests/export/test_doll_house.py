@@ -18,10 +18,9 @@ from pansplat.export.doll_house import DollHouse, _fill, _measure, _pack, _Paint
 from pansplat.gaussians.scene import Gaussians, Scene, SceneTour
 from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
-from pansplat.tours.doors import Door
 from pansplat.tours.houses import Houses
 from pansplat.tours.linked_rooms import DrawnPlace
-from pansplat.tours.plan import Plan
+from pansplat.tours.plan import Door, Plan
 from pansplat.tours.rooms import Room
 from pansplat.tours.scene_graph import make_graph
 
