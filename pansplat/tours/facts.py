@@ -143,9 +143,9 @@ class TourFacts:
         return dataclasses.replace(tour, poor=poor, clearances=clearances)
 
     @property
-    def bounds(self) -> TourGraph:
-        """The graph of a scene without edges, whose surfaces stop cameras."""
-        return self.graph.with_all_edges()
+    def ways(self) -> TourGraph:
+        """The graph along whose edges a camera flies: without an edge, between any two panoramas."""
+        return self.graph if self.tour.overlaps else self.graph.with_all_edges()
 
     @_stored
     def hidden(self) -> list[list[int]]:
