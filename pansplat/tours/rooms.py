@@ -160,7 +160,7 @@ def _enclose(
     center, places = surfaces.center[[0, 2]], surfaces.samples
     ends = measure_reach(places[np.abs(places[:, 1]) < _EYE_BAND * unit][:, (0, 2)])[:, None] * RAY_DIRECTIONS
     corners = center + ends[np.isfinite(ends[:, 0])] if floor is None else floor.corners
-    axes, least = normals[:2].T, _LEAST_HALF * unit  # the first two are at right angles
+    axes, least = np.stack((normals[0], (-normals[0, 1], normals[0, 0])), axis=1), _LEAST_HALF * unit
     low, high = np.quantile(corners @ axes, _BROAD, axis=0) if len(corners) else (center @ axes,) * 2
     low, high = np.minimum(low, center @ axes - least), np.maximum(high, center @ axes + least)
     box = Polygon(shapely.get_coordinates(shapely.box(*low, *high)) @ axes.T)
