@@ -7,6 +7,7 @@ Source: docs/rendering.md.
 ALPHA_CUT = 1 / 255  # smaller alphas count as zero: less than one step of an 8-bit image
 MAX_ALPHA = 0.99  # keeps 1 - alpha, by which gradients divide, away from zero
 FILTER_VARIANCE = 0.1  # pixel^2, added across the ray by the low-pass filter
+EXPOSURE_WAY = 12**0.5  # way of a camera during an exposure, over the standard deviation of its place on it
 EWA_DILATION = 0.3  # pixel^2: 3DGS adds it to the projected covariance
 NEAR = 0.05  # metres, by default; Gaussians whose mean is nearer are not rasterised
 EWA_NEAR_FACTOR = 0.2  # relative to `near`; 3DGS culls at this depth along the optical axis

@@ -10,7 +10,7 @@ from pansplat import constants
 _INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 
 # Names in pansplat.constants that every shader gets as #define lines.
-_CONSTANTS = ("ALPHA_CUT", "MAX_ALPHA")
+_CONSTANTS = ("ALPHA_CUT", "EXPOSURE_WAY", "MAX_ALPHA")
 
 
 def load_shader(name: str, version: str, **defines: float | str) -> str:

@@ -24,7 +24,7 @@ bool is_ball_outside(vec3 mean, float opacity, vec3 scale) {
     vec3 center = world_to_camera * offset;
     float reach = sqrt(2.0 * log(max(opacity / ALPHA_CUT, 1.0)));
     float largest = max(scale.x, max(scale.y, scale.z));
-    float radius = 1.001 * reach * (largest + sqrt(filter_variance) * length(offset) + length(shift)) + 1e-5 * length(offset);
+    float radius = 1.001 * reach * (largest + sqrt(filter_variance) * length(offset) + length(shift) / EXPOSURE_WAY) + 1e-5 * length(offset);
     for (int i = 0; i < 4; i++) {
         if (dot(sides[i], center) < -radius) return true;
     }

@@ -7,7 +7,7 @@ uniform float near;              // smallest radial distance, metres
 uniform float filter_variance;   // e^2 of section 2
 uniform vec2 half_size;          // half the image; of one off the optical axis, half the smallest one around both
 uniform float margin;            // added to the quad, for the rounding of the rasteriser
-uniform vec3 shift;              // of the camera during the exposure, its axes, metres / sqrt(12); zero at rest
+uniform vec3 shift;              // of the camera during the exposure, its axes, metres; zero at rest
 
 struct Gaussian {
     vec3 mean;
@@ -37,10 +37,10 @@ mat3 rotation_from_quat(vec4 quat) {
         2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// How a Gaussian in the unit direction n moves across the ray during the exposure, camera axes, radians / sqrt(12): its
-// covariance grows by m m', that of a line.
+// How a Gaussian in the unit direction n moves across the ray during the exposure, camera axes, radians, as a standard
+// deviation m: its covariance grows by m m', that of a line.
 vec3 find_motion(vec3 n, float radius) {
-    return (dot(n, shift) * n - shift) / radius;
+    return (dot(n, shift) * n - shift) / (EXPOSURE_WAY * radius);
 }
 
 // Sets the quad to the half axes of the ellipse x' E^-1 x = 1, E = [xx xy; xy yy], lengthened by the margin.

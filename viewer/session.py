@@ -270,7 +270,7 @@ class Session:
         state.show_message(f"{entry.name}   (H shows the keys)")
         enter_scene(state, loaded.scene, entry.tour, entry.start)
         if entry.tour is None:
-            state.graph = state.graph if loaded.facts is None else loaded.facts.bounds
+            state.graph = state.graph if loaded.facts is None else loaded.facts.graph.with_all_edges()
             limit_camera(state, state.home)
         else:
             stage.add_slot()

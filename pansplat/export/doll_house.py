@@ -28,6 +28,7 @@ from shapely.geometry import LineString, Polygon, box
 from torch import Tensor
 
 from pansplat import pipeline
+from pansplat.export.page_data import PageHouse
 from pansplat.export.photographs import read_photograph
 from pansplat.gaussians.scene import Scene
 from pansplat.geometry.equirect import sample_equirect, uv_from_directions
@@ -83,18 +84,9 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class DollHouse:
-    """Triangles with a texture.
+    """The houses as triangles, and their texture: WebP, empty without houses."""
 
-    Attributes:
-        nodes: the views of each house, and of rooms beside it: what their surroundings are turned by, radians to the
-            right, and where the camera is then, in the world.
-        corners: of the triangles of each house, clockwise as their room shows them: place in the world, and u and v in
-            the atlas, 0 to 1, v down; of tops of walls 2 + the normal of the wall, to the right and forward.
-        atlas: WebP; empty without houses.
-    """
-
-    nodes: tuple[dict[int, tuple[float, Float[np.ndarray, "3"]]], ...]
-    corners: tuple[Float[np.ndarray, "corner 5"], ...]
+    houses: tuple[PageHouse, ...]
     atlas: bytes
 
 
@@ -194,16 +186,19 @@ def _raise_walls(
 
 
 @torch.no_grad()
-def make_house(scene: Scene, houses: Houses, photographs: Sequence[PanoramaSet] = ()) -> DollHouse:
+def make_house(
+    scene: Scene, houses: Houses, origin: Float[np.ndarray, "3"], photographs: Sequence[PanoramaSet] = ()
+) -> DollHouse:
     """The doll's houses of a scene.
 
     Args:
         scene: with input cameras.
         houses: of the scene.
+        origin: of the page, in the scene's world.
         photographs: of each view; without them the images of the Gaussians.
     """
     if not houses.views:
-        return DollHouse((), (), b"")
+        return DollHouse((), b"")
     painter = _Painter(scene, houses, photographs)
     panels = build_panels(houses, painter.is_open)
     density, places = _pack(panels, _FINEST / float(np.median(houses.floors)))
@@ -218,7 +213,7 @@ def make_house(scene: Scene, houses: Houses, photographs: Sequence[PanoramaSet] 
         else:
             along = houses.show(panel.house, np.array(((0.0, 0.0, 0.0), np.insert(panel.facing, 1, 0.0))))
             uv = np.broadcast_to(2 + (along[1] - along[0])[[0, 2]], flat.shape)
-        world = houses.show(panel.house, panel.locate(flat)) @ houses.level.T
+        world = houses.show(panel.house, panel.locate(flat)) @ houses.level.T - origin
         shown[houses.hosts[panel.house]].append(np.concatenate((world, uv), axis=1))
     for panel, place, color, seen in textures:
         beside = [other for other in textures if other[0].room == panel.room and other[0].down[1] == panel.down[1]]
@@ -232,18 +227,23 @@ def make_house(scene: Scene, houses: Houses, photographs: Sequence[PanoramaSet] 
         atlas[upper : upper + padded.shape[0], left : left + padded.shape[1]] = padded
     with io.BytesIO() as file:
         Image.fromarray(atlas).save(file, "WEBP", quality=_QUALITY, method=6)
-        corners = tuple(np.concatenate(each) for each in shown.values())
-        return DollHouse(tuple(_list_nodes(houses, host) for host in shown), corners, file.getvalue())
+        corners = {host: np.concatenate(each).round(5).tolist() for host, each in shown.items()}
+        made = [
+            PageHouse(*_list_nodes(houses, host, origin), tuple(map(tuple, each))) for host, each in corners.items()
+        ]
+        return DollHouse(tuple(made), file.getvalue())
 
 
-def _list_nodes(houses: Houses, host: int) -> dict[int, tuple[float, Float[np.ndarray, "3"]]]:
-    """See `DollHouse`."""
+def _list_nodes(houses: Houses, host: int, origin: Float[np.ndarray, "3"]) -> tuple[tuple, tuple]:
+    """The views of a house and of rooms beside it, and how they are moved (`PageHouse`)."""
     found = {}
     for house in np.flatnonzero(np.array(houses.hosts) == host).tolist():
         for view in houses.views[house]:
             turn = 0.0 if house == host else houses.plan.drawn[view].turn or 0.0
-            found[view] = turn, houses.level @ houses.show(house, houses.eyes[view])
-    return dict(sorted(found.items()))
+            place = houses.level @ houses.show(house, houses.eyes[view]) - origin
+            found[view] = turn, *place.astype(np.float32).tolist()
+    nodes = tuple(sorted(found))
+    return nodes, tuple(found[view] for view in nodes)
 
 
 def _continue_walls(

@@ -27,7 +27,7 @@ from pansplat.system.progress import report_progress, stage
 from pansplat.tours.camera_path import CameraPath
 from pansplat.tours.cross_fade import CrossFade
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.graph import TourGraph
 from pansplat.tours.limits import follow_edge
 from pansplat.tours.links import link_parts
 from pansplat.tours.merge import select_views
@@ -129,11 +129,6 @@ class Shot:
     moment: Moment | None = None
     goal: Shot | None = None
 
-    @property
-    def edge(self) -> Edge | None:
-        """The edge of a tour that is flown; None is the one that the camera is at."""
-        return None if self.moment is None else self.moment.step.edge
-
     @staticmethod
     def of_moment(moment: Moment, vertical_fov_degrees: float, seconds: float) -> Shot:
         """The frame of a route."""
@@ -144,9 +139,8 @@ class Shot:
 
 def plan_visits(facts: TourFacts) -> Route:
     """A way with a rest at each panorama: through the tour of a scene, or along the cameras of another scene."""
-    is_tour = facts.scene.tour is not None
-    tour = link_parts(facts.graph) if is_tour else facts.bounds
-    walk = plan_walk(tour) if is_tour else range(len(tour))
+    tour = link_parts(facts.ways)
+    walk = plan_walk(tour) if facts.tour.overlaps else range(len(tour))
     return plan_route(tour, walk, rest=REST_SECONDS, outlooks=dict(enumerate(facts.outlooks)))
 
 
@@ -189,7 +183,7 @@ def choose_scenes(scene: Scene) -> Callable[[Shot], tuple[Scene, int]]:
         nonlocal edge
         place = shot.pose[:3, 3]
         followed = tour.find_nearest_edge(place)[0] if edge is None else follow_edge(tour, place, edge)
-        edge = shot.edge or followed
+        edge = (shot.moment and shot.moment.step.edge) or followed
         part = tour.parts[edge[0]]
         return select(tour.list_parts()[part] if scene.joint else choose_scene_views(tour)[edge]), part
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import io
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -22,7 +19,16 @@ from pansplat import pipeline
 from pansplat.errors import InputError, InputWarning
 from pansplat.export.doll_house import DollHouse, make_house
 from pansplat.export.film import FilmPhotographs
-from pansplat.export.page_data import PackedGaussians, PageConstants, pack_gaussians
+from pansplat.export.page_data import (
+    PageConstants,
+    PageHeader,
+    PageLink,
+    PageNote,
+    PagePlan,
+    PageRing,
+    PageSpot,
+    pack_gaussians,
+)
 from pansplat.export.page_files import PageFiles, write_files
 from pansplat.export.page_scene import FIT_STEPS, choose_degree, merge, prepare
 from pansplat.export.photographs import MAX_HEIGHT, PackedPhotograph, pack_photographs
@@ -35,7 +41,7 @@ from pansplat.system.console import with_progress_bar
 from pansplat.system.files import SOFTWARE
 from pansplat.system.progress import report_progress, stage
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.graph import Edge, TourGraph
+from pansplat.tours.graph import TourGraph
 from pansplat.tours.houses import find_houses
 from pansplat.tours.layout import REACH
 from pansplat.tours.links import choose_rings, link_parts
@@ -53,7 +59,7 @@ GAUSSIAN_BYTES = 22  # bytes of a Gaussian in a page
 _PHOTO_BYTES = 0.45  # bytes of a photograph in a page, over its squared rows
 _PROGRAM_BYTES = 200_000  # size of a page without its data
 _POSTER_SIZE = (810, 960)  # height and width, pixels; as high as a portrait image
-_NO_PLAN = {"worlds": (0,), "drawing": "", "isSure": True, "size": (1.0, 1.0), "places": ()}
+_NO_PLAN = PagePlan(worlds=(0,), drawing="", is_sure=True, size=(1.0, 1.0), places=())
 _SINGLE_REACH = 1.0  # metres from a panorama without others in its part, at most half the distance of its surfaces
 
 
@@ -100,31 +106,30 @@ def write_page(
         scene = dataclasses.replace(scene, starts=(), tour=None)
     has_cameras, prepared = len(scene.cam2world) > 0, prepare(scene)
     facts = TourFacts(scene if has_cameras else prepared, folder=photographs[0].folder if photographs else None)
-    is_tour = len(facts.tour.overlaps) > 0
-    tour = facts.graph if is_tour else facts.bounds
-    houses = find_houses(facts) if has_cameras else None
-    scene = prepared
-    graph = _plan_graph(tour) if is_tour else _join_all(tour)
-    house, has_pictures = DollHouse((), (), b""), len(photographs) > 0 and photo_height != 0
-    if houses is not None:
+    is_tour, tour = len(facts.tour.overlaps) > 0, facts.ways
+    groups, edges, walk = _plan_graph(tour, is_tour)
+    scene, origin = prepared, prepared.cam2world[:, :3, 3].mean(0).numpy()
+    house, has_pictures = DollHouse((), b""), len(photographs) > 0 and photo_height != 0
+    if has_cameras:
         report_progress("building the doll's house", 0.0)
-        house = make_house(scene, houses, photographs if has_pictures else ())
-    flown = _find_flown_parts(graph, tour.poor) if has_pictures and is_tour else {*graph.parts}
-    views = [view for view, part in enumerate(graph.parts) if part in flown]
+        house = make_house(scene, find_houses(facts), origin, photographs if has_pictures else ())
+    flown = {*tour.parts}
+    if has_pictures and is_tour:  # in parts without a flight the page shows photographs only
+        flown = {tour.parts[a] for a, b in tour.overlaps if a != b and (a, b) not in tour.poor}
+    views = [view for view, part in enumerate(tour.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))
     scene = dataclasses.replace(scene, gaussians=scene.gaussians.select(is_flown))
-    kept = gaussians * len(views) // len(graph.parts)
+    kept = gaussians * len(views) // len(tour.parts)
     if len(scene.gaussians) > kept:
         report_progress("merging Gaussians", 0.1)
-        scene = merge(scene, graph.parts, kept, steps=FIT_STEPS if has_cameras else 0)
+        scene = merge(scene, tour.parts, kept, steps=FIT_STEPS if has_cameras else 0)
     report_progress("compressing", 0.6)
     degree = choose_degree(scene, _TARGET_BYTES * (_GAUSSIANS_SHARE if has_pictures and not split else 1))
-    origin = scene.cam2world[:, :3, 3].mean(0).numpy()
-    packed = pack_gaussians(scene.gaussians, origin, _order_views(scene, graph), degree)
+    order = _order_views(scene, tour.parts, walk[0])
+    packed = pack_gaussians(scene.gaussians, origin, order, degree)
     report_progress("drawing the poster", 0.7)
-    first = graph.walk[0]
-    start = scene.cam2world[first].clone()
-    start[:3, :3] = torch.from_numpy(turn_axes(tour.level_axes, *_find_ahead(tour, facts, first)))
+    start = scene.cam2world[walk[0]].clone()
+    start[:3, :3] = torch.from_numpy(turn_axes(tour.level_axes, *_find_ahead(tour, facts, walk[0])))
     poster = _draw_poster(scene, start, photographs if has_pictures else ())
     pictures: list[PackedPhotograph] = []
     if has_pictures:
@@ -132,20 +137,34 @@ def write_page(
         with stage(0.95):
             pictures = pack_photographs(prepared, photographs, math.inf if split else left, photo_height)
     report_progress("writing", 0.95)
-    header = _describe_scene(prepared, packed, origin, graph, tour, facts, flown)
-    header |= {"doll": [], "photographs": [picture.describe() for picture in pictures]}
-    header["plan"] = _describe_plan(facts) if has_cameras else _NO_PLAN
-    for pose, spot, photograph in zip(scene.cam2world, header["spots"], photographs, strict=False):
-        for note in photograph.context[0].notes:
-            direction = _round(find_direction(pose, note.yaw, note.pitch).numpy())
-            spot["notes"].append({"direction": direction, "text": note.text, "addresses": note.addresses})
-    for nodes, corners in zip(house.nodes, house.corners, strict=True):
-        moves = [(turn, *_round(place - origin)) for turn, place in nodes.values()]
-        corners = (corners - [*origin, 0, 0]).round(5).tolist()
-        header["doll"].append({"nodes": [*nodes], "moves": moves, "corners": corners})
-    title = title or path.stem
-    files = write_files(path, header, packed.contents, pictures, poster, house.atlas, split, title, address)
-    inside = sum(len(each["nodes"]) for each in header["doll"])
+    linked = link_parts(tour)
+    header = PageHeader(
+        count=len(scene.gaussians),
+        degree=packed.degree,
+        color_range=packed.color_range,
+        harmonics_scale=packed.harmonics_scale,
+        views=packed.views,
+        loading=tuple(order),
+        spots=_describe_spots(prepared, origin, linked, facts, photographs),
+        links=_describe_links(linked),
+        level=tuple(map(_round, tour.level_axes)),
+        parts=tour.parts,
+        groups=groups,
+        edges=edges,
+        next=tuple(map(tuple, find_next_nodes(tour))),
+        poor=tour.poor,
+        walk=walk,
+        unit=1 / scene.frame.unit,
+        limits=_limit_parts(prepared, tour.parts, flown),
+        doll=house.houses,
+        photographs=tuple(picture.describe() for picture in pictures),
+        plan=draw_page_plan(facts.plan) if has_cameras else _NO_PLAN,
+        folder=None,
+    )
+    files = write_files(
+        path, header, packed.contents, pictures, poster, house.atlas, split, title or path.stem, address
+    )
+    inside = sum(len(each.nodes) for each in house.houses)
     return dataclasses.replace(files, num_outside=len(scene.cam2world) - inside if has_cameras else 0)
 
 
@@ -162,35 +181,18 @@ def choose_gaussians(heights: Sequence[int]) -> int:
     return min(max(int(left / GAUSSIAN_BYTES), least), most)
 
 
-@dataclass(frozen=True, eq=False)
-class _PageGraph:
-    """How the camera moves.
+def _plan_graph(
+    tour: TourGraph, is_tour: bool
+) -> tuple[tuple[tuple[int, ...], ...], tuple[tuple[int, int, int], ...], tuple[int, ...]]:
+    """Groups of views that are blended together, edges with their groups, and all views in the order of a visit.
 
-    Attributes:
-        parts: of each view; the camera moves within a part, and zooms to another one.
-        groups: views that are blended together.
-        edges: two views and the group that is blended between them.
-        walk: all views, in the order of a visit.
+    In a scene that is no tour all views are blended everywhere.
     """
-
-    parts: tuple[int, ...]
-    groups: tuple[tuple[int, ...], ...]
-    edges: tuple[tuple[int, int, int], ...]
-    walk: tuple[int, ...]
-
-
-def _plan_graph(tour: TourGraph) -> _PageGraph:
-    """The graph of a tour."""
-    scenes = choose_scene_views(tour)
+    views = tuple(range(len(tour)))
+    scenes = choose_scene_views(tour) if is_tour else dict.fromkeys(tour.overlaps, views)
     groups = tuple(dict.fromkeys(scenes.values()))
     edges = tuple((a, b, groups.index(scenes[a, b])) for a, b in tour.overlaps)
-    return _PageGraph(tour.parts, groups, edges, tuple(dict.fromkeys(plan_walk(tour))))
-
-
-def _join_all(tour: TourGraph) -> _PageGraph:
-    """The graph of a scene that is no tour, in which all views are blended everywhere."""
-    views = tuple(range(len(tour)))
-    return _PageGraph(tour.parts, (views,), tuple((a, b, 0) for a, b in tour.overlaps), views)
+    return groups, edges, tuple(dict.fromkeys(plan_walk(tour))) if is_tour else views
 
 
 def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, float]:
@@ -198,20 +200,10 @@ def _find_ahead(tour: TourGraph, facts: TourFacts, view: int) -> tuple[float, fl
     return find_start_angles(tour, view) or (find_widest(facts.outlooks[view]), 0.0)
 
 
-def _order_views(scene: Scene, graph: _PageGraph) -> list[int]:
+def _order_views(scene: Scene, parts: Sequence[int], first: int) -> list[int]:
     """The views of the part where the page starts, then the others; the nearest first."""
-    first, parts = graph.walk[0], np.array(graph.parts)
     distances = (scene.cam2world[:, :3, 3] - scene.cam2world[first, :3, 3]).norm(dim=1).numpy()
-    return np.lexsort((distances, parts != parts[first])).tolist()
-
-
-def _find_flown_parts(graph: _PageGraph, poor: Sequence[Edge]) -> set[int]:
-    """The parts of a tour that have a flight: in the others the page shows photographs only.
-
-    Args:
-        poor: edges along which no camera flies.
-    """
-    return {graph.parts[a] for a, b, _ in graph.edges if a != b and (a, b) not in poor}
+    return np.lexsort((distances, np.array(parts) != parts[first])).tolist()
 
 
 def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence[PanoramaSet]) -> bytes:
@@ -233,108 +225,70 @@ def _draw_poster(scene: Scene, pose: Float[Tensor, "4 4"], photographs: Sequence
         return file.getvalue()
 
 
-def _describe_scene(
+def _describe_spots(
     scene: Scene,
-    packed: PackedGaussians,
     origin: Float[np.ndarray, "3"],
-    graph: _PageGraph,
     tour: TourGraph,
     facts: TourFacts,
-    flown: set[int],
-) -> dict[str, Any]:
-    """The numbers of a page, without those of single Gaussians; a part of `PageHeader`.
+    photographs: Sequence[PanoramaSet],
+) -> tuple[PageSpot, ...]:
+    """The panoramas of a page.
 
     Args:
-        scene: of `prepare`, with all Gaussians.
-        flown: parts whose Gaussians are in the page.
+        scene: of `prepare`.
+        tour: with links between all parts (`link_parts`).
+        photographs: of each view, which have notes; none without them.
     """
-    level = tour.level_axes
     positions = scene.cam2world[:, :3, 3].numpy() - origin
-    marks = positions + np.outer(facts.usual_heights, level[:, 1])
-    linked, rooms = link_parts(tour), [room.panoramas for room in facts.plan.rooms] if len(positions) > 1 else []
-    spots = [
-        {
-            "name": name,
-            "position": _round(position),
-            "mark": _round(mark),
-            "notes": [],
-            "ahead": [round(angle, 5) for angle in _find_ahead(tour, facts, view)],
-            "hasStart": tour.panoramas[view].start is not None,
-            "turns": _round(find_turns(facts.outlooks[view])),
-            "rings": _describe_rings(linked, facts, view, position, rooms),
-            "clearances": tour.clearances[view].round(2).tolist(),
-        }
-        for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True))
-    ]
-    reaches = _measure_reaches(scene, np.array(graph.parts))
-    return {
-        "count": sum(packed.counts),
-        "degree": packed.degree,
-        "colorRange": packed.color_range,
-        "harmonicsScale": packed.harmonics_scale,
-        "views": [{"start": each, "count": n} for each, n in zip(packed.starts, packed.counts, strict=True)],
-        "loading": packed.order,
-        "spots": spots,
-        "links": _describe_links(linked),
-        "level": [_round(row) for row in level],
-        "parts": graph.parts,
-        "groups": graph.groups,
-        "edges": graph.edges,
-        "next": find_next_nodes(tour),
-        "poor": tour.poor,
-        "walk": graph.walk,
-        "unit": 1 / scene.frame.unit,
-        "limits": _limit_parts(reaches, graph.parts, flown),
-    }
+    marks = positions + np.outer(facts.usual_heights, tour.level_axes[:, 1])
+    rooms = [room.panoramas for room in facts.plan.rooms] if len(positions) > 1 else []
+    spots = []
+    for view, (name, position, mark) in enumerate(zip(scene.names, positions, marks, strict=True)):
+        outlook = facts.outlooks[view]
+        rings = choose_rings(tour, view, facts.usual_heights[view], facts.hidden[view], outlook, rooms)
+        ahead, notes = _find_ahead(tour, facts, view), photographs[view].context[0].notes if photographs else ()
+        spots.append(
+            PageSpot(
+                name=name,
+                position=_round(position),
+                mark=_round(mark),
+                notes=tuple(
+                    PageNote(
+                        _round(find_direction(scene.cam2world[view], note.yaw, note.pitch).numpy()),
+                        note.text,
+                        note.addresses,
+                    )
+                    for note in notes
+                ),
+                ahead=(round(ahead[0], 5), round(ahead[1], 5)),
+                has_start=tour.panoramas[view].start is not None,
+                turns=_round(find_turns(outlook)),
+                rings=tuple(PageRing(node, None if away is None else _round(position + away)) for node, away in rings),
+                clearances=tuple(map(tuple, tour.clearances[view].round(2).tolist())),
+            )
+        )
+    return tuple(spots)
 
 
-def _describe_plan(facts: TourFacts) -> dict[str, Any]:
-    """The floor plan: its drawing, and where the panoramas are on it."""
-    svg, size, places = draw_page_plan(facts.plan)
-    return {
-        "worlds": facts.tour.worlds,
-        "isSure": all(room.is_placed for room in facts.plan.rooms),
-        "drawing": base64.b64encode(svg).decode(),
-        "size": size,
-        "places": places,
-    }
+def _describe_links(tour: TourGraph) -> tuple[PageLink, ...]:
+    angles = (
+        (*way, link.text, *find_angles(tour.look(way[0], link.yaw, link.pitch))) for way, link in tour.links.items()
+    )
+    return tuple(PageLink(start, end, text, round(yaw, 5), round(pitch, 5)) for start, end, text, yaw, pitch in angles)
 
 
-def _describe_links(tour: TourGraph) -> list[dict[str, Any]]:
-    links = []
-    for (start, end), link in tour.links.items():
-        direction = tour.find_direction(start, end)
-        assert direction is not None
-        yaw, pitch = find_angles(direction)
-        links.append({"from": start, "to": end, "text": link.text, "yaw": round(yaw, 5), "pitch": round(pitch, 5)})
-    return links
-
-
-def _describe_rings(
-    tour: TourGraph, facts: TourFacts, view: int, position: Float[np.ndarray, "3"], rooms: Sequence[Sequence[int]]
-) -> list[dict[str, Any]]:
-    """The rings that a page offers at a panorama."""
-    rings = choose_rings(tour, view, facts.usual_heights[view], facts.hidden[view], facts.outlooks[view], rooms)
-    return [{"node": node, "mark": None if offset is None else _round(position + offset)} for node, offset in rings]
-
-
-def _measure_reaches(scene: Scene, parts: Int[np.ndarray, "view"]) -> Float[np.ndarray, "part"]:
-    """Median distance of the Gaussians of each part from their cameras."""
-    views = scene.gaussians.views.long()
+def _limit_parts(scene: Scene, parts: Sequence[int], flown: set[int]) -> tuple[float, ...]:
+    """How far the camera may move in each part from its edges: at most the median distance of its Gaussians."""
+    numbers, views = np.array(parts), scene.gaussians.views.long()
     distances = (scene.gaussians.means.double() - scene.cam2world[views, :3, 3]).norm(dim=1).numpy()
-    own = [distances[parts[views] == part] for part in range(parts.max() + 1)]
-    return np.array([max(float(np.median(each)) if len(each) else 0.0, 1e-3) for each in own])
+    limits, most = [], REACH if max(parts) > 0 else math.inf
+    for part in range(max(parts) + 1):
+        own = distances[numbers[views] == part]
+        reach = max(float(np.median(own)) if len(own) else 0.0, 1e-3)
+        limit = min(_SINGLE_REACH, 0.5 * reach) if parts.count(part) == 1 else min(reach, most)
+        limits.append(limit if part in flown else 0.0)
+    return tuple(limits)
 
 
-def _limit_parts(reaches: Float[np.ndarray, "part"], parts: Sequence[int], flown: set[int]) -> list[float]:
-    """How far the camera may move in each part from its edges."""
-    most = REACH if len(reaches) > 1 else math.inf
-    limits = [
-        min(_SINGLE_REACH, 0.5 * reach) if parts.count(part) == 1 else min(reach, most)
-        for part, reach in enumerate(reaches.tolist())
-    ]
-    return [limit if part in flown else 0.0 for part, limit in enumerate(limits)]
-
-
-def _round(vector: np.ndarray) -> list[float]:
-    return [float(value) for value in np.float32(vector)]
+def _round(vector: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(value) for value in np.float32(vector))

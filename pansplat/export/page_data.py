@@ -48,7 +48,7 @@ class PageView(_Record):
 
     start: int
     count: int
-    files: tuple[str, ...]
+    files: tuple[str, ...] = ()
 
 
 class PageNote(_Record):
@@ -216,18 +216,14 @@ class PackedGaussians:
 
     Attributes:
         contents: gzip of planes of bytes of each view.
-        order: views in the order of their Gaussians.
-        starts: index of the first Gaussian of each view.
-        counts: number of Gaussians of each view.
+        views: the Gaussians of each, without files.
         degree: of the harmonics.
         color_range: colours of the bytes 0 and 255.
         harmonics_scale: coefficient of the byte 127.
     """
 
     contents: tuple[bytes, ...]
-    order: tuple[int, ...]
-    starts: tuple[int, ...]
-    counts: tuple[int, ...]
+    views: tuple[PageView, ...]
     degree: int
     color_range: tuple[float, float]
     harmonics_scale: float
@@ -278,8 +274,8 @@ def pack_gaussians(
     ]
     with ThreadPoolExecutor() as threads:
         contents = tuple(threads.map(_compress, (blocks[rank] for rank in np.argsort(order))))
-    starts, counts = (tuple(values[np.argsort(order)].tolist()) for values in (ends[:-1], np.diff(ends)))
-    return PackedGaussians(contents, tuple(order), starts, counts, degree, (low, high), scale)
+    views = tuple(PageView(int(ends[rank]), int(ends[rank + 1] - ends[rank])) for rank in np.argsort(order))
+    return PackedGaussians(contents, views, degree, (low, high), scale)
 
 
 def _compress(block: bytes) -> bytes:

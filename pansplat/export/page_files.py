@@ -13,13 +13,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote, urljoin
 
 import msgspec
 
 from pansplat.errors import InputError
-from pansplat.export.page_data import PageHeader
+from pansplat.export.page_data import PageHeader, PageView
 from pansplat.export.page_program import fill_template, to_script
 from pansplat.export.photographs import PackedPhotograph, label_files
 from pansplat.system.atomic import replacing
@@ -55,7 +54,7 @@ class PageFiles:
 
 def write_files(
     path: Path,
-    header: dict[str, Any],
+    header: PageHeader,
     contents: Sequence[bytes],
     pictures: Sequence[PackedPhotograph],
     poster: bytes,
@@ -67,18 +66,20 @@ def write_files(
     """Write the page, and its parts if it is split.
 
     Args:
+        header: without the names of files.
         contents: of the Gaussians of each view.
         atlas: of the doll's house.
     """
-    count, names = header["count"], [spot["name"] for spot in header["spots"]]
+    names = [spot.name for spot in header.spots]
     labels = label_files(names)
     parts: dict[str, bytes] = {}
     tags: dict[int, list[str]] = {}  # HTML elements of the Gaussians of each view
+    views: list[PageView] = []
     for view, content in enumerate(contents):
         ends = [len(content)] if split else [*range(_PART_BYTES, len(content), _PART_BYTES), len(content)]
         chunks = [content[start:end] for start, end in pairwise((0, *ends))]
         named = {_name_part(labels[view], chunk, "bin"): chunk for chunk in chunks}
-        header["views"][view]["files"] = [*named]
+        views.append(msgspec.structs.replace(header.views[view], files=tuple(named)))
         parts |= named
         calls = [f"addChunk({view}, {'true' if chunk is chunks[-1] else 'false'})" for chunk in chunks]
         tags[view] = [
@@ -87,6 +88,7 @@ def write_files(
         ]
     folder = path.with_name(f"{path.stem}_files")
     folder_address = quote(os.fsencode(folder.name)) if split else None
+    header = msgspec.structs.replace(header, views=tuple(views), folder=folder_address)
     elements: list[str] = []
     texts = {"og:title": title, "og:description": f"{describe_count(len(names), 'panorama')}: {list_first(names)}"}
     if split:
@@ -98,7 +100,7 @@ def write_files(
             parts |= picture.make_files()
     else:
         parts = {}
-        first, *others = header["loading"]
+        first, *others = header.loading
         shown = [picture.make_elements() for picture in pictures] or [[] for _ in tags]
         # The smallest photograph of the first panorama, its Gaussians, and then its photograph.
         elements = [*shown[first][:1], *tags[first], *shown[first][1:]]
@@ -114,11 +116,11 @@ def write_files(
         description=html.escape(texts["og:description"]),
         properties="\n".join(f'<meta property="{name}" content="{html.escape(text)}">' for name, text in texts.items()),
         poster=base64.b64encode(poster).decode(),
-        header=to_script(msgspec.to_builtins(msgspec.convert(header | {"folder": folder_address}, PageHeader))),
+        header=to_script(msgspec.to_builtins(header)),
         parts="\n".join(elements),
     ).encode(errors="replace")  # a title from a file name that is not UTF-8
     if len(page) > MAX_FILE_BYTES and not split:
-        fitting = math.floor(0.95 * count * MAX_FILE_BYTES / len(page))
+        fitting = math.floor(0.95 * header.count * MAX_FILE_BYTES / len(page))
         raise InputError(
             f"{path}: needed a page of at most {MAX_FILE_BYTES // 1_000_000} MB in one file, got "
             f"{len(page) / 1e6:.0f} MB; write a folder (--out without a suffix), or keep at most {fitting:,} "
@@ -136,9 +138,9 @@ def write_files(
     files.insert(0, path)
     total = len(page) + sum(map(len, parts.values()))
     photo_height = max((picture.height for picture in pictures), default=0)
-    zooms = tuple((names[a], names[b]) for a, b in header["poor"])
-    num_flights = sum(a != b for a, b, _ in header["edges"]) - len(zooms)
-    return PageFiles(tuple(files), total, count, photo_height, num_flights, zooms)
+    zooms = tuple((names[a], names[b]) for a, b in header.poor)
+    num_flights = sum(a != b for a, b, _ in header.edges) - len(zooms)
+    return PageFiles(tuple(files), total, header.count, photo_height, num_flights, zooms)
 
 
 def _name_part(label: str, content: bytes, suffix: str) -> str:

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +29,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pansplat import pipeline
+from pansplat.export.page_data import PagePhotograph
 from pansplat.export.training_set import cut_faces
 from pansplat.gaussians.scene import Scene
 from pansplat.images.cube_images import DENSE_FACE
@@ -88,9 +88,9 @@ class PackedPhotograph:
         """The bytes of all tiles."""
         return sum(map(len, self.tiles))
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> PagePhotograph:
         """The description of the photograph that photographs.js reads."""
-        return {"name": self.name, "levels": self.levels, "rotation": self.rotation.tolist()}
+        return PagePhotograph(self.name, self.levels, tuple(map(tuple, self.rotation.tolist())))
 
     def make_elements(self) -> list[str]:
         """The elements of a page in one file that hold the tiles of the smallest level, and all others."""
@@ -196,7 +196,7 @@ def _cover_hidden(
     if shown.min() >= 1:
         return image.clamp(0, 1)
     rows = min(scene.height, _HIDDEN_ROWS)
-    drawn = pipeline.render(*_select_shown(scene, view), size=(rows, 2 * rows)).color.clamp(0, 1)
+    drawn = pipeline.render(_select_shown(scene, view), scene.cam2world[view], size=(rows, 2 * rows)).color.clamp(0, 1)
     drawn = functional.interpolate(drawn[None].to(image), image.shape[1:], mode="bilinear")[0]
     return torch.where(shown > 0, torch.lerp(drawn, image.clamp(0, 1), shown), drawn)
 
@@ -211,14 +211,13 @@ def load_photograph(
     return image, shown
 
 
-def _select_shown(scene: Scene, view: int) -> tuple[Scene, Float[Tensor, "4 4"]]:
-    """What a page draws at a panorama, and its pose (4, 4)."""
-    pose = scene.cam2world[view]
+def _select_shown(scene: Scene, view: int) -> Scene:
+    """What a page draws at a panorama."""
     if scene.tour is None:
-        return scene, pose
+        return scene
     tour = make_graph(scene)
-    edge, _ = tour.find_nearest_edge(pose[:3, 3].numpy())
-    return select_views(scene, choose_scene_views(tour)[edge]), pose
+    edge, _ = tour.find_nearest_edge(scene.cam2world[view, :3, 3].numpy())
+    return select_views(scene, choose_scene_views(tour)[edge])
 
 
 def _fade_from_hidden(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

@@ -6,6 +6,7 @@ and stand beside the others. Drawings are 1:50.
 
 from __future__ import annotations
 
+import base64
 import html
 import io
 import math
@@ -22,6 +23,7 @@ from shapely import affinity
 from shapely.geometry import LineString, Polygon
 
 from pansplat.errors import InputError
+from pansplat.export.page_data import PagePlan
 from pansplat.gaussians.scene import Scene
 from pansplat.system.atomic import replacing
 from pansplat.system.descriptions import describe_count
@@ -30,7 +32,8 @@ from pansplat.tours.facts import TourFacts
 from pansplat.tours.floor import list_storeys_of_worlds
 from pansplat.tours.layout import arrange_in_rows
 from pansplat.tours.linked_rooms import turn_plan
-from pansplat.tours.plan import Plan, Room
+from pansplat.tours.plan import Plan
+from pansplat.tours.rooms import Room
 
 _PAPER = 0.02  # metres of paper for a metre of the plan: 1:50
 _INCH = 0.0254  # metres
@@ -108,13 +111,17 @@ def write_plan(scene: Scene, path: str | Path, folder: Path | None = None) -> Pl
     return plan
 
 
-def draw_page_plan(plan: Plan) -> tuple[bytes, tuple[float, float], list[tuple[float, float, float | None]]]:
-    """The plan for a corner of a page as SVG, its width and height, and the place of each panorama from the upper left
-    corner, metres, with what its azimuths are turned by."""
+def draw_page_plan(plan: Plan) -> PagePlan:
+    """The plan for a corner of a page."""
     drawing = _Drawing(plan, is_small=True)
-    places = drawing.panoramas * (1, -1) + (0, drawing.size[1])
-    marks = [(x, y, heading) for (x, y), heading in zip(places.tolist(), drawing.headings, strict=True)]
-    return _draw_figure(drawing, "svg"), drawing.size, marks
+    places = (drawing.panoramas * (1, -1) + (0, drawing.size[1])).tolist()
+    return PagePlan(
+        worlds=plan.tour.worlds,
+        drawing=base64.b64encode(_draw_figure(drawing, "svg")).decode(),
+        is_sure=all(room.is_placed for room in plan.rooms),
+        size=drawing.size,
+        places=tuple((x, y, heading) for (x, y), heading in zip(places, drawing.headings, strict=True)),
+    )
 
 
 def describe_plan(plan: Plan) -> list[str]:
@@ -200,7 +207,8 @@ class _Drawing:
 
     def _turn(self, places: Float[np.ndarray, "*n 2"], node: int) -> Float[np.ndarray, "*n 2"]:
         """Places around a panorama in its turned world."""
-        return self.plan.draw(node, places) @ self._turns[self._pieces[node][0]]
+        moved = self.plan.drawn[node].move(places) if node in self.plan.drawn else places
+        return moved @ self._turns[self._pieces[node][0]]
 
     @cached_property
     def _layout(self) -> tuple[dict[tuple[int, int], Float[np.ndarray, "2"]], tuple[float, float]]:

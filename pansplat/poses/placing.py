@@ -26,7 +26,7 @@ from pansplat.images.image_files import read_height, read_panorama
 from pansplat.poses.axes import SceneAxes, find_axes
 from pansplat.poses.dense import Surroundings, compare
 from pansplat.poses.depth import estimate_depth
-from pansplat.tours.floor import find_ceiling, trace_floor
+from pansplat.tours.floor import find_ceiling, find_floor_outline
 from pansplat.tours.linked_rooms import WALL_THICKNESS, turn_plan
 
 DEPTH_HEIGHT = 384  # rows of the panorama whose depth is estimated
@@ -140,8 +140,8 @@ class Piece:
         depth = self.surroundings.depth.log_depth
         rays = pixel_directions(*depth.shape).numpy()
         places = (rays * np.exp(depth)[..., None])[::_OUTLINE_STEP, ::_OUTLINE_STEP].reshape(-1, 3)
-        found = trace_floor(places.astype(np.float64))
-        return None if found is None else found[0] / found[1]
+        found = find_floor_outline(places.astype(np.float64), np.zeros(2))
+        return None if found is None else found.corners / found.camera_height
 
     @functools.cached_property
     def _lintels(self) -> tuple[Float[Array, "n 2"], Float[Array, "n"]] | None:

@@ -19,7 +19,8 @@ from pansplat.tours.edges import find_poor_edges, find_walls
 from pansplat.tours.floor import FloorOutline, choose_camera_height, find_ceiling, find_floor, find_floor_outline
 from pansplat.tours.graph import Edge, TourGraph, ViewNumbers
 from pansplat.tours.outlook import find_hidden, measure_clearance, measure_outlook
-from pansplat.tours.plan import Door, Plan, Room, make_plan
+from pansplat.tours.plan import Door, Plan, make_plan
+from pansplat.tours.rooms import Room
 from pansplat.tours.scene_graph import describe_tour, make_graph
 from pansplat.tours.surfaces import Surfaces, find_surfaces
 
@@ -115,7 +116,7 @@ class TourFacts:
 
     @_stored
     def _floors(self) -> list[FloorOutline | None]:
-        return [find_floor_outline(own) for own in self.surfaces.values()]
+        return [find_floor_outline(own.samples, own.center[[0, 2]]) for own in self.surfaces.values()]
 
     @cached_property
     def outlines(self) -> dict[int, FloorOutline]:
@@ -142,9 +143,9 @@ class TourFacts:
         return dataclasses.replace(tour, poor=poor, clearances=clearances)
 
     @property
-    def bounds(self) -> TourGraph:
-        """The graph of a scene without edges, whose surfaces stop cameras."""
-        return self.graph.with_all_edges()
+    def ways(self) -> TourGraph:
+        """The graph along whose edges a camera flies: without an edge, between any two panoramas."""
+        return self.graph if self.tour.overlaps else self.graph.with_all_edges()
 
     @_stored
     def hidden(self) -> list[list[int]]:

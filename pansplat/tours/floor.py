@@ -13,7 +13,7 @@ from jaxtyping import Float
 from shapely.geometry import Polygon
 
 from pansplat.tours.graph import TourGraph
-from pansplat.tours.surfaces import Surfaces, split_by_azimuth
+from pansplat.tours.surfaces import split_by_azimuth
 
 _UNSEEN_FLOOR = 0.15  # height of a camera over a floor that is not seen, as a fraction of far
 _AZIMUTHS = 180  # number of corners of a floor outline
@@ -72,23 +72,16 @@ def find_floor(places: Float[np.ndarray, "n 3"]) -> float | None:
     return float(np.exp(np.median(logs[np.abs(logs - peak) < 0.08])))
 
 
-def find_floor_outline(surfaces: Surfaces) -> FloorOutline | None:
-    """The floor outline of a panorama; None if it shows no floor.
+def find_floor_outline(places: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "2"]) -> FloorOutline | None:
+    """The floor outline of a panorama.
 
     At each azimuth the floor (`find_floor`) ends at the distance within which 98 % of it is, or at the surfaces that
-    stand on it, if these are nearer.
-    """
-    found = trace_floor(surfaces.samples)
-    return None if found is None else FloorOutline(surfaces.center[[0, 2]] + found[0], found[1])
-
-
-def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "azimuth 2"], float] | None:
-    """Where the floor ends around a camera (right, forward), and its height over it.
-
-    It ends at doors. None if places show no floor, or one that still goes on in rays, through wide openings.
+    stand on it, if these are nearer. It ends at doors. None if places show no floor, or one that still goes on in rays,
+    through wide openings.
 
     Args:
         places: of surfaces relative to the camera (right, down, forward), in any unit.
+        center: of the camera, right and forward.
     """
     height = find_floor(places)
     if height is None:
@@ -106,7 +99,7 @@ def trace_floor(places: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "az
     angles = (np.arange(_AZIMUTHS) + 0.5) * 2 * math.pi / _AZIMUTHS
     corners = _close_doors(reach[:, None] * np.stack((np.sin(angles), np.cos(angles)), axis=1), _NECK * height)
     shape = Polygon(corners)
-    return (corners, height) if shape.area > _LEAST_FULL * shape.convex_hull.area else None
+    return FloorOutline(center + corners, height) if shape.area > _LEAST_FULL * shape.convex_hull.area else None
 
 
 def _close_doors(corners: Float[np.ndarray, "azimuth 2"], neck: float) -> Float[np.ndarray, "azimuth 2"]:

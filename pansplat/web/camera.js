@@ -2,7 +2,7 @@
 // OpenCV axes (x right, y down, z forward), as everywhere in pansplat. Positions are in the scene's world, moved by its
 // origin. Matrices are arrays of rows.
 
-import { clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, fromAxes, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled } from "./graph.js";
+import { clamp, closestOnEdge, column, DEGREE, distanceOf, dot, ease, followEdge, fromAxes, indexOfLeast, limitStep, minus, multiply, nearestEdge, partOfEdge, plus, scaled, timeOf } from "./graph.js";
 import { camera, changed, currentPart, edges, endsOfEdge, GRAPH, parts, shown, state } from "./state.js";
 
 const SOFT = 0.3; // share of the way to the limit of the camera, at its end, in which steps become shorter
@@ -132,7 +132,7 @@ export function showViews(step) {
 export function updateEdge(now) {
   const { fade } = state;
   if (fade) {
-    const t = clamp((now - fade.began) / (1000 * HEADER.fadeSeconds), 0, 1);
+    const t = timeOf(now, fade.began, HEADER.fadeSeconds);
     fade.done = ease(t);
     if (t === 1) state.fade = null;
     changed();

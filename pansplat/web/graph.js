@@ -23,6 +23,7 @@ export const fromAxes = (axes, vector) => axes.map((row) => dot(row, vector));
 export const unit = (vector) => scaled(vector, 1 / Math.max(Math.hypot(...vector), 1e-9));
 export const distanceOf = (a, b) => Math.hypot(...minus(a, b));
 export const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+export const timeOf = (now, began, seconds) => seconds ? clamp((now - began) / (1000 * seconds), 0, 1) : 1; // fraction of a duration
 export const ease = (t) => t * t * (3 - 2 * t);
 export const wrapAngle = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle)); // -pi to pi
 export const indexOfLeast = (values) => values.indexOf(Math.min(...values));

@@ -1,10 +1,21 @@
-// Draws the doll's house: triangles with the element `atlas` as texture, of which only fronts are seen.
+// Shows the doll's house: triangles with the element `atlas` as texture, of which only fronts are seen.
 
 import { findHouse } from "./doll.js";
 import { byId } from "./dom.js";
-import { state } from "./state.js";
+import { camera, changed, state } from "./state.js";
 
 const houses = new WeakMap(); // what each renderer needs
+
+export const canShowDoll = () => state.sorted !== null && byId("atlas")?.complete === true;
+
+// Opens or closes the doll's house without a flight. `isDue`: it opens when its data is there.
+export function setDoll(isOn, isDue = false) {
+  const { doll } = state;
+  if (doll.isOn && !isOn) camera.fov = doll.fov;
+  Object.assign(doll, { isOn, isDue, flight: null });
+  byId("doll").setAttribute("aria-pressed", isOn || isDue);
+  changed();
+}
 
 function makeHouse(renderer) {
   const { gl } = renderer, triangles = gl.createVertexArray(), atlas = gl.createTexture();
@@ -21,7 +32,7 @@ function makeHouse(renderer) {
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LOD, 3); // the margins of the textures are as wide
   const sharper = gl.getExtension("EXT_texture_filter_anisotropic");
   if (sharper) gl.texParameteri(gl.TEXTURE_2D, sharper.TEXTURE_MAX_ANISOTROPY_EXT, 8);
-  return { triangles, atlas, ...renderer.link(SHADERS.house) };
+  return { triangles, atlas, ...renderer.link(SHADERS.house, "atlas") };
 }
 
 // Draws to the canvas, which has a depth and several samples a pixel.
@@ -42,7 +53,6 @@ export function drawHouse({ position, rotation, center, half }, width, height) {
   gl.uniformMatrix3fv(places.level, true, HEADER.level.flat());
   gl.uniform3fv(places.position, position);
   gl.uniform4f(places.window, ...center, ...half);
-  gl.uniform1i(places.atlas, 0);
   renderer.bind([atlas]);
   gl.bindVertexArray(triangles);
   const first = HEADER.doll.slice(0, HEADER.doll.indexOf(house)).reduce((sum, { corners }) => sum + corners.length, 0);

@@ -4,8 +4,9 @@ import { tangentOf, turn, walk } from "./camera.js";
 import { orbit, resizeDoll, zoomDoll } from "./doll.js";
 import { byId, canvas, say, showMore } from "./dom.js";
 import { embed } from "./embed.js";
-import { enterAt, flyTo, goHome, setPose, setTouring, toggleDoll } from "./flight.js";
+import { enterAt, flyTo, toggleDoll, toggleTour } from "./flight.js";
 import { clamp, DEGREE, distanceOf, dot, multiply } from "./graph.js";
+import { endWay, goHome, setPose } from "./jump.js";
 import { measure } from "./measure.js";
 import { plan } from "./plan.js";
 import { openList } from "./rings.js";
@@ -28,7 +29,7 @@ const MOVES = {
   KeyQ: [0, -1, 0],
 };
 const PRESSES = {
-  Space: () => setTouring(!state.isTouring),
+  Space: () => toggleTour(),
   KeyF: () => toggleFull(),
   KeyR: () => goHome(),
   KeyH: () => byId("keys").showModal(),
@@ -68,12 +69,12 @@ function onKey(event) {
   }
   else if (PRESSES[event.code] && !event.repeat) PRESSES[event.code]();
   else if (HEADER.spots[spot]) {
-    setTouring(false);
+    endWay();
     flyTo(spot);
   }
   else return;
   event.preventDefault();
-  if (MOVES[event.code]) setTouring(false);
+  if (MOVES[event.code]) endWay();
 }
 
 // One finger or the mouse turns: the scene follows the pointer. Two fingers pull the scene: sideways, and forward by
@@ -98,7 +99,7 @@ function onMove(event) {
     const metres = 2 * HEADER.speed / Math.min(canvas.clientWidth, canvas.clientHeight);
     const gap = distanceOf(...before), apart = distanceOf(...fingers.values());
     if (state.doll.isOn) zoomDoll(gap / Math.max(apart, 1));
-    setTouring(false);
+    endWay();
     walk(-0.5 * moved[0] * metres, 0, (0.5 * moved[1] + apart - gap) * metres);
   }
 }
@@ -200,7 +201,7 @@ export function listen() {
     if (measure.isOn) measure.take(clientX, clientY);
     else if (state.doll.isOn) enterAt(clientX, clientY);
   });
-  byId("play").onclick = () => setTouring(!state.isTouring);
+  byId("play").onclick = toggleTour;
   byId("home").onclick = goHome;
   byId("place").onclick = openList;
   byId("list").onclick = ({ target }) => target === byId("list") && target.close(); // a click beside the dialog

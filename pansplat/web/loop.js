@@ -5,8 +5,9 @@ import { nodeWithin, showViews, tangentOf, updateEdge, walk } from "./camera.js"
 import { orbitByKeys } from "./doll.js";
 import { canvas, fullSize } from "./dom.js";
 import { embed } from "./embed.js";
-import { advanceDollFlight, advanceWay, isWaiting, updateStill } from "./flight.js";
+import { advanceDollFlight, advanceWay } from "./flight.js";
 import { clamp, inAxes, minus, scaled } from "./graph.js";
+import { isWaiting, updateStill } from "./jump.js";
 import { loadAround, requestSort } from "./loading.js";
 import { measure } from "./measure.js";
 import { placeNotes } from "./notes.js";

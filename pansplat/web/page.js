@@ -4,8 +4,9 @@
 import { cameraFor, settleAt, showViews, tallOf } from "./camera.js";
 import { byId, canvas } from "./dom.js";
 import { embed } from "./embed.js";
-import { flyTo, jumpTo, PHOTO_WAIT_MS, setPose, setTouring } from "./flight.js";
+import { flyTo } from "./flight.js";
 import { listen } from "./input.js";
+import { endWay, jumpTo, PHOTO_WAIT_MS, setPose } from "./jump.js";
 import { fail, failure, load, loadAround } from "./loading.js";
 import { isSettled, onFrame } from "./loop.js";
 import { makeNotes } from "./notes.js";
@@ -125,7 +126,7 @@ window.pansplat = Object.assign(new EventTarget(), {
   isSettled,
   async goTo(panorama, { jump = false } = {}) {
     const node = findNode(panorama);
-    setTouring(false);
+    endWay();
     return embed.await(node, () => jump ? jumpTo(node) : flyTo(node));
   },
   async render(width, height) {

@@ -188,7 +188,7 @@ class Photographs {
     if (!HEADER.photographs.length || !state.renderer) return;
     if (this.renderer !== state.renderer) { // the graphics were lost
       this.made.clear();
-      Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph), opacity: 0 });
+      Object.assign(this, { renderer: state.renderer, program: state.renderer.link(SHADERS.photograph, "preview", "detail"), opacity: 0 });
     }
     const isStill = this.last !== null && distanceOf(camera.position, this.last) === 0 || state.headset.session !== null;
     this.last = [...camera.position];
@@ -247,8 +247,6 @@ class Photographs {
     gl.viewport(left, bottom, width, height);
     gl.useProgram(program);
     gl.uniform2f(places.origin, left, bottom);
-    gl.uniform1i(places.preview, 0);
-    gl.uniform1i(places.detail, 1);
     levels[0].bind(0);
     (chosen.texture ? chosen : levels.filter(({ texture }) => texture).at(-1)).bind(1);
     // The rows of the inverse are the columns of the rotation; y of a cube map is up.

@@ -1,6 +1,6 @@
 // Draws the Gaussians of HEADER's views with WebGL 2 (docs/rendering.md), as they arrive.
 
-import { inAxes, scaled, unit } from "./graph.js";
+import { inAxes, unit } from "./graph.js";
 
 const TEXTURE_WIDTH = 2048; // WebGL 2 guarantees 2048 texels a side, which is 4,194,304 Gaussians
 
@@ -12,9 +12,9 @@ export class Renderer {
     const half = float || gl.getExtension("EXT_color_buffer_half_float");
     this.formats = half ? [gl.RGBA16F, gl.RG16F] : [gl.RGBA8, gl.RG8];
     this.hasDepth = Boolean(half);
-    this.splat = this.link(SHADERS.splat);
+    this.splat = this.link(SHADERS.splat, "geometry", "colors", "order", "scales");
     this.accumulate = this.link(SHADERS.accumulate);
-    this.resolve = this.link(SHADERS.resolve);
+    this.resolve = this.link(SHADERS.resolve, "sum_color", "sum_depth");
     const width = TEXTURE_WIDTH, height = Math.max(Math.ceil(HEADER.count / width), 1);
     if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this device.");
     this.geometry = this.makeTexture(width, height, gl.RGBA32UI);
@@ -32,7 +32,8 @@ export class Renderer {
     this.size = [0, 0];
   }
 
-  link([vertex, fragment]) {
+  // `textures`: names of its textures, in the order of `bind`.
+  link([vertex, fragment], ...textures) {
     const gl = this.gl, program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
@@ -50,6 +51,8 @@ export class Renderer {
       const { name } = gl.getActiveUniform(program, i);
       places[name.replace("[0]", "")] = gl.getUniformLocation(program, name);
     }
+    gl.useProgram(program);
+    textures.forEach((name, unit) => gl.uniform1i(places[name], unit));
     return { program, places };
   }
 
@@ -159,8 +162,6 @@ export class Renderer {
     gl.useProgram(program);
     gl.uniform2i(places.origin, left, bottom);
     gl.uniform3f(places.background, 0, 0, 0);
-    gl.uniform1i(places.sum_color, 0);
-    gl.uniform1i(places.sum_depth, 1);
     this.bind(this.targets[1].textures);
     gl.bindVertexArray(this.screen);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -188,7 +189,7 @@ export class Renderer {
     // GLSL reads columns: the rows of camera-to-world are the columns of its inverse.
     gl.uniformMatrix3fv(places.world_to_camera, false, rotation.flat());
     gl.uniform3fv(places.position, position);
-    gl.uniform3fv(places.shift, scaled(inAxes(rotation, shift), 1 / Math.sqrt(12)));
+    gl.uniform3fv(places.shift, inAxes(rotation, shift));
     gl.uniform1f(places.near, HEADER.near);
     gl.uniform1f(places.filter_variance, HEADER.filterVariance / (focal[0] * focal[1]));
     gl.uniform2f(places.half_size, Math.abs(x) + w, Math.abs(y) + h);
@@ -199,10 +200,6 @@ export class Renderer {
     gl.uniform2fv(places.color_range, HEADER.colorRange);
     const sides = [[-1, 0, w + x], [1, 0, w - x], [0, -1, h + y], [0, 1, h - y]].map(unit);
     gl.uniform3fv(places.sides, sides.flat());
-    gl.uniform1i(places.geometry, 0);
-    gl.uniform1i(places.colors, 1);
-    gl.uniform1i(places.order, 2);
-    gl.uniform1i(places.scales, 3);
   }
 
   bind(textures) {

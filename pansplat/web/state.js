@@ -36,7 +36,7 @@ export const state = {
   isDirty: true,
   drawnScale: 0,
   lastChange: 0,
-  // flight.js
+  // flight.js and jump.js
   way: null,
   isTouring: false,
   still: null,

@@ -6,8 +6,9 @@
 
 import { blendWeights, findSpot, floorPoint, walk } from "./camera.js";
 import { byId, calm, explain } from "./dom.js";
-import { coverage, goHome, goTo, isOnWay, jumpTo, setTouring } from "./flight.js";
+import { goTo } from "./flight.js";
 import { clamp, column, cross, distanceOf, dot, fromAxes, minus, multiply, plus, scaled, unit } from "./graph.js";
+import { coverage, endWay, goHome, jumpTo } from "./jump.js";
 import { requestSort } from "./loading.js";
 import { advance, SORT_DISTANCE } from "./loop.js";
 import { photographs } from "./photographs.js";
@@ -76,12 +77,7 @@ class Headset {
   start(session) {
     if (state.doll.isOn) jumpTo(state.doll.node);
     this.heading = this.headYaw = 0;
-    this.head =
-      this.origin =
-      this.left =
-      this.floor =
-      this.hovered =
-        null;
+    Object.assign(this, { head: null, origin: null, left: null, floor: null, hovered: null });
     this.last = performance.now();
     this.motion = 0; // strength of the vignette
     this.pressed = new Map();
@@ -141,7 +137,7 @@ class Headset {
     this.left = [...camera.position];
     requestSort(SORT_DISTANCE);
     this.adaptScale(1000 * seconds);
-    this.motion += (Number(isWalking || isOnWay()) - this.motion) * Math.min(8 * seconds, 1);
+    this.motion += (Number(isWalking || state.way !== null) - this.motion) * Math.min(8 * seconds, 1);
     const marks = this.findMarks(frame), layer = session.renderState.baseLayer;
     for (const view of pose.views) {
       if (view.requestViewportScale) view.requestViewportScale(this.scale);
@@ -243,7 +239,7 @@ class Headset {
     }
     this.isTurned = Math.abs(turn) > (this.isTurned ? 0.3 : 0.6);
     if (Math.hypot(right, forward) < DEAD_ZONE) return false;
-    if (isOnWay()) setTouring(false);
+    if (state.way) endWay();
     walk(...scaled([right, 0, forward], seconds * HEADER.speed));
     return true;
   }
@@ -347,7 +343,7 @@ class Headset {
     const { gl } = this;
     if (this.renderer !== state.renderer) {
       this.renderer = state.renderer;
-      this.program = state.renderer.link(SHADERS.mark);
+      this.program = state.renderer.link(SHADERS.mark, "picture");
       this.picture = gl.createTexture();
       this.hovered = null;
     }
@@ -356,9 +352,7 @@ class Headset {
     gl.uniformMatrix3fv(places.world_to_camera, false, eye.rotation.flat());
     gl.uniform3fv(places.position, eye.position);
     gl.uniform4f(places.window, ...eye.center, ...eye.half);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
-    gl.uniform1i(places.picture, 0);
+    state.renderer.bind([this.picture]);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(state.renderer.screen);

@@ -20,7 +20,8 @@ from pansplat.geometry.equirect import pixel_directions
 from pansplat.inputs.panorama_sets import Panorama, PanoramaSet
 from pansplat.tours.houses import Houses
 from pansplat.tours.linked_rooms import DrawnPlace
-from pansplat.tours.plan import Door, Plan, Room
+from pansplat.tours.plan import Door, Plan
+from pansplat.tours.rooms import Room
 from pansplat.tours.scene_graph import make_graph
 
 FLOOR, CEILING = 1.5, -1.1  # from the cameras, downwards
@@ -88,8 +89,7 @@ def photograph(tmp_path: Path) -> Callable[..., list[PanoramaSet]]:
 
 def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     """Random places of all textured triangles, and their colours in the atlas, 0 to 1."""
-    (corners,) = house.corners
-    triangles = corners.reshape(-1, 3, 5)
+    triangles = np.array(house.houses[0].corners).reshape(-1, 3, 5)
     triangles = triangles[triangles[..., 3:].max(axis=(1, 2)) <= 1]
     shares = np.random.default_rng(0).dirichlet((1, 1, 1), (count, len(triangles)))
     places, uv = np.split(np.einsum("ntk,tkc->ntc", shares, triangles).reshape(-1, 5), [3], axis=1)
@@ -99,7 +99,7 @@ def _sample(house: DollHouse, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_all_is_on_the_floor_or_a_wall_and_has_the_colour_of_its_place(scene, houses, photograph) -> None:
-    house = make_house(scene, houses, photograph())
+    house = make_house(scene, houses, np.zeros(3), photograph())
     places, colors = _sample(house)
     walls = shapely.union_all([outline.exterior for outline in (*BOXES, PASSAGE)])
     to_wall = shapely.distance(walls, shapely.points(places[:, [0, 2]]))
@@ -153,7 +153,7 @@ def test_a_place_has_the_colour_of_the_nearest_camera_that_sees_it(scene, houses
     hidden = see_box(np.array((0.5, -2, 1.0)), np.array((0.6, 2, 3.0)), np.array((0.55, 0, 2)), 4000)
     screen = Gaussians.cat([scene.gaussians, make_balls(hidden, 0.03, views=0)])
     for shown, expected in ((scene, 0), (dataclasses.replace(scene, gaussians=screen), 2)):
-        house = make_house(shown, houses, pairs)
+        house = make_house(shown, houses, np.zeros(3), pairs)
         places, colors = _sample(house, 3000)
         own = colors.argmax(axis=1)
         x, y, z = places.T
@@ -187,10 +187,10 @@ def test_a_room_of_another_world_stands_beside_the_house_on_its_floor(scene: Sce
     vars(plan)["drawn"] = {2: DrawnPlace(0, math.pi / 2, np.array((8.0, 10.0)))}
     floors = np.array((FLOOR, FLOOR, FLOOR - 0.2))
     apart = dataclasses.replace(houses, plan=plan, floors=floors, views=((0, 1), (2,)))
-    house = make_house(scene, apart)
-    (corners,), ((*_, moved),) = house.corners, (house.nodes[0].values(),)
-    assert len(house.nodes) == 1 and moved[0] == math.pi / 2
-    assert moved[1] == pytest.approx((8 + CAMERAS[2][2], 0.2, 10 - CAMERAS[2][0]))
+    (house,) = make_house(scene, apart, np.zeros(3)).houses
+    corners, (*_, (turn, *place)) = np.array(house.corners), house.moves
+    assert house.nodes == (0, 1, 2) and turn == math.pi / 2
+    assert place == pytest.approx((8 + CAMERAS[2][2], 0.2, 10 - CAMERAS[2][0]))
     is_moved, is_wall = corners[:, 0] > 7.5, corners[:, 3:].max(axis=1) <= 1
     low, high = (find(corners[is_moved & is_wall, :3], axis=0) for find in (np.min, np.max))
     assert low[[0, 2]] == pytest.approx((8, 2), abs=1e-3) and high == pytest.approx((12, FLOOR, 4.8), abs=1e-3)
@@ -207,15 +207,15 @@ def test_textures_of_many_rooms_fit_into_the_atlas(houses: Houses) -> None:
 
 
 def test_without_a_house_there_is_no_atlas(scene: Scene, houses: Houses) -> None:
-    house = make_house(scene, dataclasses.replace(houses, views=()))
-    assert (house.corners, house.atlas) == ((), b"")
+    house = make_house(scene, dataclasses.replace(houses, views=()), np.zeros(3))
+    assert (house.houses, house.atlas) == ((), b"")
 
 
 def test_without_photographs_the_gaussians_are_shown(scene: Scene, houses: Houses) -> None:
     means = scene.gaussians.means
     color = torch.from_numpy(_color(means.numpy()))
     gaussians = make_balls(means, 0.03, 0.99, color=color, views=scene.gaussians.views)
-    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), houses)
+    house = make_house(dataclasses.replace(scene, gaussians=gaussians, height=128), houses, np.zeros(3))
     places, colors = _sample(house)
     assert np.median(np.abs(colors - _color(places)).max(axis=1)) < 0.1
 

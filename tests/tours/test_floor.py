@@ -29,14 +29,14 @@ def room_scene() -> Scene:
 def test_the_floor_of_a_room_ends_at_its_walls(room_scene):
     level = room_scene.cam2world[0, :3, :3].numpy()
     (surfaces,) = find_surfaces(room_scene, level)
-    outline = find_floor_outline(surfaces)
+    outline = find_floor_outline(surfaces.samples, surfaces.center[[0, 2]])
     assert outline.camera_height == pytest.approx(1.5, abs=0.01)
     inside = (outline.corners - (-1, -2)) / (4, 6)
     border = np.minimum(inside, 1 - inside).min(axis=1)
     assert np.abs(border).max() < 0.04, "all corners are near a wall"
     scene = Scene(room_scene.gaussians.select(torch.arange(20)), room_scene.cam2world, 0.45, 10.0)
     (few,) = find_surfaces(scene, level)
-    assert find_floor_outline(few) is None and floor.find_floor(few.samples) is None
+    assert find_floor_outline(few.samples, np.zeros(2)) is None and floor.find_floor(few.samples) is None
     assert floor.find_floor(surfaces.samples) == outline.camera_height
     assert floor.choose_camera_height((1.0, None, 1.4, 1.6), 10.0) == 1.4
     assert floor.choose_camera_height((None,), 10.0) == 1.5
@@ -96,12 +96,14 @@ def _floor_of(*boxes: tuple[float, float, float, float]) -> np.ndarray:
 
 def test_a_floor_ends_at_a_door_though_it_is_seen_beyond():
     room, door, beyond = (-2.0, 1.5, -1.5, 2.0), (1.5, 1.7, -0.3, 0.35), (1.7, 6.0, -2.0, 3.0)
-    corners, height = floor.trace_floor(_floor_of(room, door, beyond))
-    assert height == pytest.approx(1.5, rel=0.01)
+    outline = find_floor_outline(_floor_of(room, door, beyond), np.zeros(2))
+    assert outline.camera_height == pytest.approx(1.5, rel=0.01)
+    corners = outline.corners
     assert corners[:, 0].max() < 2.0 and corners.min(axis=0) == pytest.approx((-2.0, -1.5), abs=0.1)
 
 
 def test_rays_through_several_wide_openings_are_no_outline():
     wide = [(0.5, 6.0, -0.5, 0.5), (-6.0, -0.5, -0.5, 0.5), (-0.5, 0.5, 0.5, 6.0), (-0.5, 0.5, -6.0, -0.5)]
-    assert floor.trace_floor(_floor_of((-0.9, 0.9, -0.9, 0.9), *wide)) is None
-    assert floor.trace_floor(_floor_of((-0.9, 4.0, -0.9, 0.9), (-0.9, 0.9, -0.9, 4.0))) is not None, "an L is a room"
+    assert find_floor_outline(_floor_of((-0.9, 0.9, -0.9, 0.9), *wide), np.zeros(2)) is None
+    l_room = _floor_of((-0.9, 4.0, -0.9, 0.9), (-0.9, 0.9, -0.9, 4.0))
+    assert find_floor_outline(l_room, np.zeros(2)) is not None

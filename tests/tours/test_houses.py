@@ -4,15 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-import shapely
 import torch
 from synthetic_scenes import make_balls, place_cameras, see_box
 
 from pansplat.gaussians.scene import Scene, SceneTour
 from pansplat.tours.facts import TourFacts
-from pansplat.tours.floor import FloorOutline
 from pansplat.tours.houses import find_houses
-from pansplat.tours.plan import _enclose
 
 LOW, HIGH = np.array((-2.0, -1.1, -3.0)), np.array((2.5, 1.5, 2.0))  # of the room around a camera: x, y down, z
 PLACES = ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (10.0, 0.0, 0.0))
@@ -53,15 +50,3 @@ def test_an_upper_storey_is_another_house(rooms: Scene) -> None:
     gaussians = dataclasses.replace(rooms.gaussians, means=rooms.gaussians.means + shift)
     above = dataclasses.replace(rooms, gaussians=gaussians, cam2world=poses)
     assert find_houses(TourFacts(above)).views == ((0, 1), (2,))
-
-
-def test_a_floor_without_walls_ends_where_most_of_it_does(rooms: Scene) -> None:
-    """A tenth of the horizon looks through a window to each side, where the floor seems to go on."""
-    azimuths = (np.arange(360) + 0.5) * np.pi / 180
-    rays = np.stack((np.sin(azimuths), np.cos(azimuths)), axis=1)
-    ends = 2.0 / np.abs(rays).max(axis=1)
-    beyond = np.abs((azimuths + np.pi / 4) % (np.pi / 2) - np.pi / 4) < np.pi / 10
-    corners = rays * np.where(beyond, 6.0, ends)[:, None] + np.array((5.0, 0.0))
-    floor, surfaces = FloorOutline(corners, 1.5), TourFacts(rooms).surfaces[1]
-    outline = _enclose(surfaces, floor, np.eye(2), shapely.Polygon(), 1.5)
-    assert shapely.Polygon(outline).bounds == pytest.approx((3.0, -2.0, 7.0, 2.0), abs=0.1)

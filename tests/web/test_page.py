@@ -92,10 +92,10 @@ def test_the_page_of_a_room_has_its_plan_and_what_hides_marks(tmp_path: Path) ->
     header = describe(room, tmp_path / "room.html")
     level, middle = np.array(header["level"]), cameras[:, :3, 3].mean(dim=0).numpy()
     found, (expected,) = header["plan"], TourFacts(room).plan.rooms
-    svg, size, marks = draw_page_plan(TourFacts(room).plan)
-    assert found["worlds"] == [0, 0] and b"west / east" in svg
-    assert base64.b64decode(found["drawing"]) == svg and found["size"] == pytest.approx(size)
-    assert np.allclose(level, make_graph(room).level_axes) and np.allclose(found["places"], marks)
+    plan = draw_page_plan(TourFacts(room).plan)
+    assert found["worlds"] == [0, 0] and b"west / east" in base64.b64decode(plan.drawing)
+    assert found["drawing"] == plan.drawing and found["size"] == pytest.approx(plan.size)
+    assert np.allclose(level, make_graph(room).level_axes) and np.allclose(found["places"], plan.places)
     c, s = math.cos(found["places"][0][2]), math.sin(found["places"][0][2])
     step = (cameras[1, :3, 3] - cameras[0, :3, 3]).numpy() @ level[:, (0, 2)] @ ((c, -s), (s, c)) * (1, -1)
     assert np.subtract(found["places"][1], found["places"][0])[:2] == pytest.approx(step, abs=1e-5)

@@ -218,7 +218,7 @@ def _with_facts(entry: SceneEntry, scene: "Scene", is_final: bool = True) -> Loa
     if not len(scene.cam2world):
         return LoadedScene(entry, scene, is_final)
     facts = TourFacts(scene)
-    _ = facts.bounds, facts.usual_heights, facts.hidden, facts.outlooks  # computed in this thread
+    _ = facts.graph, facts.usual_heights, facts.hidden, facts.outlooks  # computed in this thread
     return LoadedScene(entry, scene, is_final, facts.forget_surfaces())
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pansplat.constants import NEAR
+from pansplat.constants import EXPOSURE_WAY, NEAR
 
 Mode = Literal["joint", "view", "deferred"]
 RendererChoice = Literal["auto", "gl", "cpu"]
@@ -56,7 +56,7 @@ class DrawSettings:
     @property
     def largest_blur(self) -> float:
         """Standard deviation, radians, by which the movement blurs the nearest Gaussians at most."""
-        return math.ceil(_BLUR_STEPS * math.hypot(*self.shift)) / _BLUR_STEPS / (math.sqrt(12) * self.near)
+        return math.ceil(_BLUR_STEPS * math.hypot(*self.shift)) / _BLUR_STEPS / (EXPOSURE_WAY * self.near)
 
     @property
     def splat_colors(self) -> Literal["color", "levels", "views"]:

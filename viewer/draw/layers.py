@@ -6,7 +6,6 @@ splats with OpenGL: it projects Gaussians to records and rasterises the records 
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Hashable
 
@@ -261,7 +260,7 @@ class SplatRasterizer:
             filter_variance=camera.filter_deviation**2,
             half_size=camera.half_size,
             margin=0.02 / camera.focal,
-            shift=tuple((camera.rotation.T @ settings.shift / math.sqrt(12)).tolist()),
+            shift=tuple((camera.rotation.T @ settings.shift).tolist()),
         )
         x, y, width, height = place
         set_uniforms(

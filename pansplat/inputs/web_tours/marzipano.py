@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pansplat.errors import InputError
-from pansplat.images.cube_faces import find_gap, keep_complete
+from pansplat.images.cube_faces import keep_complete
 from pansplat.images.cube_images import COLUMN, MAX_SIZE, ROW, CubeImage, CubeLevel
 from pansplat.inputs.panorama_sets import Link, Note
 from pansplat.inputs.web_tours.entries import (
@@ -120,10 +120,10 @@ def _find_levels(key: str, scene: Mapping[str, Any], source: Path) -> tuple[Cube
 
 
 def _list_levels(base: str, stated: Sequence[tuple[int, int]], first: int, folder: Path) -> Iterator[CubeLevel]:
-    """The levels if they count from `first`, without a level 0 that is in preview.jpg only."""
+    """The levels if they count from `first`; a level 0 may have no tiles."""
     for place, (pixels, tile) in enumerate(stated, start=first):
         level = CubeLevel(pixels, tile, tuple(f"{base}/{place}/{face}/{ROW}/{COLUMN}.jpg" for face in _FACES))
-        if not _has_more_tiles(level, folder) and (place or find_gap(level, folder) is None):
+        if not _has_more_tiles(level, folder):
             yield level
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pansplat.constants import MAX_MAGNITUDE, MAX_SCALE_RATIO, MIN_COMPENSATION, OPACITY_CUT
+from pansplat.constants import EXPOSURE_WAY, MAX_MAGNITUDE, MAX_SCALE_RATIO, MIN_COMPENSATION, OPACITY_CUT
 from pansplat.rendering.cpu import records as layout
 from pansplat.rendering.cpu.harmonics import evaluate_basis, evaluate_colors
 from pansplat.rendering.cpu.simd import (
@@ -123,7 +123,7 @@ def project_gaussians(
     values, kept = workspace.array((num, 4), np.float32), workspace.array(num, np.uint8)
     coefficients = gaussians.harmonics.reshape(num, 3 * gaussians.harmonics.shape[1])
     work = partial(
-        _project_gaussians, *gaussians, coefficients, *camera, np.array(shift) / math.sqrt(12),
+        _project_gaussians, *gaussians, coefficients, *camera, np.array(shift) / EXPOSURE_WAY,
         gaussians.view_dependent, records.reshape(-1), values, radii, kept,
     )  # fmt: skip
     parallel_for(work, -(-num // GAUSSIANS_PER_ITEM), threads)
