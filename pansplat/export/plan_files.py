@@ -126,7 +126,8 @@ def draw_page_plan(plan: Plan) -> PagePlan:
 
 def describe_plan(plan: Plan) -> list[str]:
     """Lines on the size of a plan and its uncertainty."""
-    closed = [room for room in plan.rooms if room.is_closed]
+    dots = {node for node, place in plan.drawn.items() if place.turn is None}
+    closed = [room for room in plan.rooms if room.is_closed and dots.isdisjoint(room.panoramas)]
     area = sum(room.shape.area for room in closed)
     spread = "" if plan.scale_error is None else f", which differ by {100 * plan.scale_error:.1f} %"
     count = describe_count(plan.num_heights, "panorama")
@@ -134,9 +135,12 @@ def describe_plan(plan: Plan) -> list[str]:
         f"{describe_count(len(closed), 'room')}, {_format_number(plan, area, 1, power=2)} m² between the walls",
         f"scale: cameras {_format_number(plan, plan.camera_height, 2)} m over the floor (median of {count}{spread})",
     ]
-    inside = {node for room in closed for node in room.panoramas}
-    if outside := [panorama.label for node, panorama in enumerate(plan.tour.panoramas) if node not in inside]:
+    inside, labels = {node for room in closed for node in room.panoramas}, [view.label for view in plan.tour.panoramas]
+    if outside := [label for node, label in enumerate(labels) if node not in inside | dots]:
         lines.append(f"thin: by the extent of the floor, as walls do not close around {', '.join(outside)}")
+    if dots:
+        names = ", ".join(labels[node] for node in sorted(dots))
+        lines.append(f"dots without walls: nothing shows how they are turned: {names}; a link back would")
     if not all(room.is_placed for room in plan.rooms):
         about = " or are approximate" if plan.drawn else ""
         lines.append(f"dashed: rooms whose places are not known{about}")

@@ -84,6 +84,17 @@ def test_a_room_at_an_approximate_place_is_dashed_where_its_neighbour_has_it(tmp
     assert _read_svg(tmp_path / "plan.svg")[1].count("about here") == 1
 
 
+def test_a_room_with_a_link_from_one_side_only_is_a_dot_that_is_named_and_not_counted() -> None:
+    house = make_rooms()
+    tour = SceneTour(((0, 1, 0.5), (2, 2, 1.0)), ((0, 2, 0.5, 0.0, ""),))
+    known, plan = make_plan(house), make_plan(dataclasses.replace(house, tour=tour))
+    name = plan.tour.panoramas[2].label
+    assert len(_Drawing(plan).rooms) == len(_Drawing(known).rooms) - 1
+    assert describe_plan(known)[0].startswith("2 rooms") and describe_plan(plan)[0].startswith("1 room,")
+    lines = [line for line in describe_plan(plan) if name in line]
+    assert len(lines) == 1 and lines[0].startswith("dots")
+
+
 def test_texts_are_neither_on_walls_nor_on_dots_nor_on_one_another() -> None:
     """The hall is at an approximate place over the corner of the L, and a camera without walls is beside a wall."""
     names = ("Living room", "Living room", "Hall", "Closet")
