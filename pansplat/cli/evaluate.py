@@ -32,7 +32,9 @@ class _Prediction(PredictOptions):
     """How scenes are predicted. The cache is not used, so that times are valid."""
 
     height: Height | None = _HEIGHT
+    """Panoramas and targets are resized to this height, pixels."""
     refine_steps: Annotated[CountOrNone | None, arg(name="refine")] = 0
+    """Steps of the refinement after the prediction; 0 for none."""
     cache: Annotated[bool, Fixed, Suppress] = False
 
 

@@ -154,12 +154,17 @@ class Render(Computation):
         stereo = {"eye_distance": self.ipd} if self.stereo else {}
         return options | stereo | {"layout": layout, "size": (height, 2 * height)}
 
+    def _require_cameras(self, scene: Scene, advice: str) -> None:
+        if not len(scene.cam2world):
+            raise InputError(f"{self.path}: needed input cameras to stand between, got none; {advice}.")
+
     def _pose_between_cameras(self, scene: Scene) -> Tensor:
         import torch
 
         from pansplat.export.film import plan_visits
         from pansplat.tours.facts import TourFacts
 
+        self._require_cameras(scene, "give a camera pose with --pose")
         fraction = 0.5 if self.at is None else self.at
         return (
             torch.from_numpy(plan_visits(TourFacts(scene)).pose(fraction))
@@ -175,8 +180,7 @@ class Render(Computation):
 
         if path is not None:
             return follow_path(path, self.fps, scene, make_graph(scene) if scene.tour else None)
-        if not len(scene.cam2world):
-            raise InputError(f"{self.path} has no input cameras to fly between; give a camera path with --path")
+        self._require_cameras(scene, "give a camera path with --path")
         return list_frames(plan_visits(TourFacts(scene)), self.fps, self.fov, self.seconds)
 
     def _make_film(

@@ -77,8 +77,8 @@ def save_weights(path: str | Path, weights: WeightsFile) -> None:
         "compat": weights.compat,
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.tensors.items()}
-    with replacing(path, failures=(safetensors.SafetensorError,)) as partial:
-        safetensors.torch.save_file(tensors, partial, metadata)
+    with replacing(path) as partial:  # `save_file` makes files that nobody else may read
+        partial.write_bytes(safetensors.torch.save(tensors, metadata))
 
 
 def load_weights(path: str | Path) -> WeightsFile:

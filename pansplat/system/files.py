@@ -166,7 +166,9 @@ def require_output_file(option: str, path: Path, suffixes: tuple[str, ...] = (),
     if not path.parent.is_dir():
         raise InputError(f"{option} {path}: needed an existing folder, got {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise InputError(f"{option} {path}: needed a writable folder, got {path.parent}, which is read-only")
+        raise InputError(
+            f"{option} {path}: needed a writable folder, got {path.parent}, which is read-only; choose another"
+        )
     require_replaceable(option, [path], overwrite)
 
 

@@ -32,7 +32,7 @@ class DataConfig:
     """room: a room of boxes in random proportions and colours, no files. panogrf, 360loc: these data sets.
     pairs: a folder as for `pansplat predict`, with targets. triplets: NAME.json with NAME_0.png ... next to it."""
     root: Path | None = None
-    """Folder of the data; not used for room."""
+    """Folder of the data; none for room."""
     validation_root: Path | None = None
     """Folder of the validation data of pairs and triplets; the same by default."""
     draws: Count = 1000
@@ -148,10 +148,11 @@ class TrainConfig:
         check_numbers(self, prefixed=True)
         if not self.heights:
             raise InputError("--heights must be at least one height, got none.")
-        if self.data.kind != "room" and self.data.root is None:
-            raise InputError(
-                f"--data.kind {self.data.kind} needs --data.root, the folder that holds the data, got none."
+        if (self.data.kind == "room") != (self.data.root is None):
+            needed = (
+                "no --data.root, because it is generated" if self.data.root else "--data.root, a folder of the data"
             )
+            raise InputError(f"--data.kind {self.data.kind} needs {needed}, got {self.data.root or 'none'}.")
 
 
 _CHANGEABLE = ("out", "device", "checkpoint", "validation")

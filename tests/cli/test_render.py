@@ -54,6 +54,13 @@ def test_the_pose_of_a_file_is_drawn(scene: Path, tmp_path: Path) -> None:
     assert np.abs(image - render(scene, tmp_path / "expected.png", "--at", 0.25)).max() <= 1
 
 
+@pytest.mark.parametrize(("out", "option"), [("x.png", "--pose"), ("x.mp4", "--path")])
+def test_a_scene_without_cameras_needs_a_pose_or_a_path(out: str, option: str, scene: Path, tmp_path, refusal) -> None:
+    pipeline.save(pipeline.load(scene), tmp_path / "bare.splat")
+    message = refusal("render", tmp_path / "bare.splat", "-o", tmp_path / out)
+    assert "bare.splat: needed input cameras" in message and option in message
+
+
 def test_a_video_moves_between_the_cameras(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.mp4"
     assert run(["render", str(scene), "-o", str(out), "--height", "18", "--seconds", "0.5", "--fps", "8"]) == 0

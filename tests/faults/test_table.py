@@ -88,7 +88,7 @@ OPTIONS = [
         ("--size huge", "WIDTHxHEIGHT"), ("--pair kitchen", "number from 1 to 1 or one of scene"), ("--path no.json", "no.json"))),
     Fault("view: a scene that is missing", "pansplat-view nowhere", says="no such file or folder"),
     *(Fault(f"train {options}", f"pansplat-train {options} --device cpu --data.workers 0 --perceptual structure", says=says) for options, says in (
-        ("small", "needs --data.root"), ("pansplat-256 --data.root nowhere", "--network.init"), ("tiny --network.init none.safetensors", "none.safetensors"), ("", "tiny"),
+        ("small", "needs --data.root"), ("tiny --data.root nowhere", "needs no --data.root"), ("pansplat-256 --data.root nowhere", "--network.init"), ("tiny --network.init none.safetensors", "none.safetensors"), ("", "tiny"),
         ("gigantic", "gigantic"), ("tiny --optimizer.stepps 3", "--optimizer.steps"), ("tiny --memory.backpropagation three-step", "two-step"))),
     *(Fault(f"bench {options}", f"bench {options}", says=says) for options, says in (
         ("raster --height 20", "multiple of 8"), ("raster none.ply", "none.ply"), ("model --height 80", "multiple of 64"), ("model --pair nowhere", "nowhere is not a folder"),

@@ -1,11 +1,14 @@
 """The table of gpu.sh: refinements and films on each device, time beside error."""
 
-import json
+import re
 import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+_REPORT = r"(?m)^(\d+) steps in ([\d.]+) s.* error of .* pixels ([\d.]+) before, ([\d.]+) after$"
+"""What `pansplat refine` prints."""
 
 
 def read_frames(file: Path) -> np.ndarray:
@@ -20,11 +23,11 @@ def main(folder: Path) -> None:
     """Print the table of what a folder has."""
     print("| work | device | wall s | steps | s per step | error before | after |\n|---|---|---:|---:|---:|---:|---:|")
     for work in ("steps", "seconds"):
-        for file in sorted(folder.glob(f"{work}-*.json")):
-            report, wall = json.loads(file.read_text()), file.with_suffix(".seconds").read_text().strip()
-            each = report["seconds"] / max(report["steps"], 1)
-            error = f"{report['before']:.5f} | {report['after']:.5f}"
-            print(f"| refine, {work} | {file.stem.split('-')[1]} | {wall} | {report['steps']} | {each:.4f} | {error} |")
+        for file in sorted(folder.glob(f"{work}-*.log")):
+            wall = file.with_suffix(".seconds").read_text().strip()
+            for steps, seconds, before, after in re.findall(_REPORT, file.read_text())[-1:]:
+                row = f"{wall} | {steps} | {float(seconds) / max(int(steps), 1):.4f} | {before} | {after}"
+                print(f"| refine, {work} | {file.stem.split('-')[1]} | {row} |")
     films = sorted(folder.glob("film-*.mp4"))
     for film in films:
         print(f"| film | {film.stem[5:]} | {film.with_suffix('.seconds').read_text().strip()} | | | | |")

@@ -45,9 +45,9 @@ devices() {
     for name in $names; do
         local common=(assets/living_room --device "$name" --verbose --overwrite)
         step $each "steps-$name" $bin/pansplat refine "${common[@]}" --layers --height $rows --steps $refined \
-            -o "$OUT/steps-$name.ply" --report "$OUT/steps-$name.json"
+            -o "$OUT/steps-$name.ply"
         step $each "seconds-$name" $bin/pansplat refine "${common[@]}" --layers --height $rows --steps 400 --seconds 10 \
-            -o "$OUT/seconds-$name.ply" --report "$OUT/seconds-$name.json"
+            -o "$OUT/seconds-$name.ply"
         step $each "film-$name" $bin/pansplat render "${common[@]}" --predict-height $rows --refine 0 --seconds $film \
             -o "$OUT/film-$name.mp4"
     done
