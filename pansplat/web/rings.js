@@ -63,8 +63,9 @@ export function placeRings(rotation) {
     const offset = minus(mark, camera.position);
     return { ring, offset, distance: Math.hypot(...offset), place: isKnown ? findPlace(ring, inAxes(rotation, offset), focal, bars) : null };
   });
+  const places = placed.flatMap(({ place }) => place ? [place] : []);
   for (const { ring, offset, place } of placed.sort((a, b) => Number(!a.place) - Number(!b.place) || a.distance - b.distance)) {
-    const { button, label } = ring, { style } = button, found = place ? { box: place, side: null } : findBorder(offset, focal, sides, taken);
+    const { button, label } = ring, { style } = button, found = place ? { box: place, side: null } : findBorder(offset, focal, sides, [...taken, ...places]);
     if (!found) continue;
     const { box, side } = found, [left, top, right, bottom] = box;
     button.hidden = false;

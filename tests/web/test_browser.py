@@ -266,6 +266,32 @@ def test_what_is_outside_of_the_picture_is_an_arrow_that_leads_there(ring_page: 
     page.wait(AT_SECOND)
 
 
+def test_no_arrow_covers_a_ring(ring_page: OpenPage) -> None:
+    """The second panorama is in the picture, near its right border; the third one beyond it, as high."""
+    page = ring_page
+    page.look(position=page.run("HEADER.spots[1].position"))
+    position, level, *old = page.run(
+        "[HEADER.spots[0].position, HEADER.level, HEADER.spots[1].mark, HEADER.spots[2].mark]"
+    )
+    set_mark = "([node, mark]) => mark.forEach((value, k) => { HEADER.spots[node].mark[k] = value; })"
+    for node, yaw in ((1, 62), (2, 90)):
+        ahead = 3 * np.array((math.sin(math.radians(yaw)), 0, math.cos(math.radians(yaw))))
+        page.page.evaluate(set_mark, [node, (position + np.array(level) @ ahead).tolist()])
+    page.look(position=position, yaw=0, pitch=0, fov=75)
+    ring, arrow = (page.page.locator(f"#spots button[title='Go to room {n}']") for n in (1, 2))
+    classes, boxes = (
+        [each.get_attribute("class") for each in (ring, arrow)],
+        [ring.bounding_box(), arrow.bounding_box()],
+    )
+    for node, mark in enumerate(old, 1):
+        page.page.evaluate(set_mark, [node, mark])
+    assert classes == ["", "arrow right"]
+    of_ring, of_arrow = boxes
+    assert of_ring["x"] + of_ring["width"] > of_arrow["x"], "both are at the border"
+    upper, lower = sorted(boxes, key=lambda box: box["y"])
+    assert upper["y"] + upper["height"] < lower["y"]
+
+
 def test_no_ring_is_under_the_buttons(ring_page: OpenPage) -> None:
     """The second panorama comes nearer to the right edge, along the bottom row of the picture."""
     shown = """() => {
