@@ -275,7 +275,7 @@ def _take_buffer(size: int) -> npt.NDArray[np.uint8]:
         fitting = [i for i, buffer in enumerate(_idle) if size + _ALIGNMENT <= buffer.nbytes <= 2 * size + 4096]
         if fitting:
             return _idle.pop(min(fitting, key=lambda i: _idle[i].nbytes))
-    return np.empty(size + _ALIGNMENT, np.uint8)
+    return np.empty(size + size // 8 + _ALIGNMENT, np.uint8)  # the next image may need a little more
 
 
 def release_idle_memory() -> None:

@@ -149,6 +149,12 @@ def test_pooled_memory_is_reused_after_the_last_view_of_it():
 
 
 @pytest.mark.usefixtures("no_idle_memory")
+def test_an_array_that_grows_from_image_to_image_seldom_needs_new_memory():
+    sizes = [100_000 + 1000 * number for number in range(12)]
+    assert len({Workspace().array(size, np.uint8).ctypes.data for size in sizes}) == 1
+
+
+@pytest.mark.usefixtures("no_idle_memory")
 def test_a_workspace_that_ends_while_the_lock_is_held_does_not_wait():
     workspace = Workspace()
     address = workspace.array(5000, np.uint8).ctypes.data
