@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, ParamSpec, TextIO, TypeVar
 
 from pansplat.errors import InputError, InputWarning
 from pansplat.system.allocator import keep_freed_memory
+from pansplat.system.descriptions import describe_time_left
 from pansplat.system.progress import is_progress_shown, show_progress, stage
 
 if TYPE_CHECKING:
@@ -351,7 +352,7 @@ class _TimeLeft:
         if whole > _MAX_RATIO * min(*wholes, self._shortest) or whole > _MAX_WHOLE:
             return ""
         self._shortest = min(self._shortest, whole)
-        return f"about {whole - (now - began):.0f} s left"
+        return describe_time_left(whole - (now - began))
 
 
 def _print_progress() -> Callable[[str, float], None]:

@@ -1,4 +1,4 @@
-"""Parts of the short texts that stand for objects (`repr`): names, counts and ranges."""
+"""Parts of short texts, such as those that stand for objects (`repr`): names, counts, ranges and times."""
 
 from collections.abc import Sequence
 
@@ -20,3 +20,8 @@ def describe_range(low: float, high: float, unit: str = "") -> str:
     low_text, high_text = f"{low:.3g}", f"{high:.3g}"
     unit = f" {unit}" if unit else ""
     return f"{low_text}{unit}" if low_text == high_text else f"{low_text} to {high_text}{unit}"
+
+
+def describe_time_left(seconds: float) -> str:
+    """An estimate of remaining seconds, such as "about 30 s left" or "about 2 min left"."""
+    return f"about {seconds / 60:.0f} min left" if seconds > 90 else f"about {5 * round(seconds / 5) or 5} s left"

@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Generic, TypeVar
 
+from pansplat.system.descriptions import describe_time_left
 from pansplat.system.progress import show_progress
 
 Result = TypeVar("Result")
@@ -79,8 +80,7 @@ class BackgroundWorker(Generic[Result]):
         seconds, done = time.monotonic() - self._task.started, self._task.fraction
         if seconds < _LEAST_SECONDS or done < _LEAST_FRACTION:
             return f"{seconds:.0f} s"
-        left = seconds * (1 - done) / done
-        return f"about {left / 60:.0f} min left" if left > 90 else f"about {5 * round(left / 5) or 5} s left"
+        return describe_time_left(seconds * (1 - done) / done)
 
     def poll(self) -> Result | BaseException | None:
         """The result or the exception of work that is finished, once; None before."""
