@@ -114,7 +114,7 @@ def write_page(
         report_progress("building the doll's house", 0.0)
         house = make_house(scene, find_houses(facts), origin, photographs if has_pictures else ())
     flown = {*tour.parts}
-    if has_pictures and is_tour:  # in parts without a flight the page shows photographs only
+    if has_pictures and is_tour:  # a part of the tour without a flight is shown by photographs, without Gaussians
         flown = {tour.parts[a] for a, b in tour.overlaps if a != b and (a, b) not in tour.poor}
     views = [view for view, part in enumerate(tour.parts) if part in flown]
     is_flown = torch.from_numpy(np.isin(scene.gaussians.views.numpy(), views))

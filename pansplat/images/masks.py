@@ -76,7 +76,7 @@ def find_holes(image: Float[Tensor, "3 height width"], *, is_scan: bool = False)
     """
     black = (image.detach().cpu().numpy().max(axis=0) <= 0).astype(np.uint8)
     patches = cv2.morphologyEx(black, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    if not is_scan:
+    if not is_scan and patches.any():  # labels take four bytes a pixel
         labels = cv2.connectedComponents(patches)[1]
         patches *= np.isin(labels, labels[[0, -1]])
     return torch.from_numpy(cv2.dilate(patches, np.ones((5, 5), np.uint8)) > 0)

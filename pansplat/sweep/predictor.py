@@ -41,6 +41,7 @@ class Sweep:
     default_height = 1024
     """Largest height that is chosen for a pair without a given height."""
     takes_holes = True
+    """Whether a call may have the argument `holes`."""
 
     def __init__(
         self, config: SearchConfig | None = None, prior: NetworkPrior | None = None, name: str = "sweep"

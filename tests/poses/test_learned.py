@@ -105,7 +105,8 @@ def test_a_matcher_on_a_card_finds_what_it_finds_on_the_processor(matcher, room,
     found, wanted = (
         dict(zip(map(tuple, m.indices.tolist()), m.prior.tolist(), strict=True)) for m in (matches, expected)
     )
-    both = sorted(found.keys() & wanted.keys())  # in any order, and some are at a limit
+    # The order of matches is free, and rounding decides those whose score is close to the least one.
+    both = sorted(found.keys() & wanted.keys())
     assert len(both) >= 0.99 * max(len(found), len(wanted))
     np.testing.assert_allclose([found[pair] for pair in both], [wanted[pair] for pair in both], atol=1e-3)
 

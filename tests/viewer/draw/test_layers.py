@@ -33,7 +33,7 @@ def drawn(monkeypatch) -> list[int]:
 
 @pytest.mark.parametrize(("mode", "color_bits"), [("joint", 16), ("deferred", 32)])
 def test_cached_faces_give_image_and_depth_of_direct_drawing(make_renderer, random_scene, pose, turn, mode, color_bits):
-    scene = random_scene(400, size=0.2)  # of several pixels, which resampling hardly blurs
+    scene = random_scene(400, size=0.2)  # Gaussians of several pixels, which resampling hardly blurs
     scene = replace(scene, gaussians=replace(scene.gaussians, scales=scene.gaussians.scales.clamp_min(0.15)))
     kept, direct = make_renderer(scene, color_bits=color_bits, slot=1), make_renderer(scene)
     for degrees in (0, 40, 100, 170, 260):
